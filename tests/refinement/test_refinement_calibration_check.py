@@ -8,7 +8,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from aligned_surfaces import OPTIONS, path, surfaces
+from aligned_surfaces import OPTIONS, SHARP, path, surfaces
+from corner_views import CAMERA, corner
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.refinement.calibration_check import (
@@ -27,6 +28,7 @@ from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, longe
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views.pair_equations import Round
 from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.engine.views import prepare_view
 
 
 def kept(offset: float, views: int = 12) -> tuple[list[SampledView], Refined]:
@@ -51,6 +53,27 @@ def test_range_offset_raises_alarm():
     assert found.gap.closes
     assert found.support is not None
     assert found.support[1] > found.support[0]
+
+
+@pytest.mark.nightly_part
+def test_odometry_contradicts_errors_that_lead_away_from_it():
+    wrong = replace(CAMERA, fx=1.06 * CAMERA.fx, fy=1.06 * CAMERA.fy)
+    truth = path(12)
+    frames = [replace(corner(T), index=k, camera=wrong) for k, T in enumerate(truth)]
+    views = [SampledView.of(prepare_view(frame, SHARP), 1500) for frame in frames]
+    refined = refine(views, truth, OPTIONS)
+
+    def check(poses: np.ndarray) -> CalibrationCheck:
+        witness = se3.inverse(poses[0]) @ poses
+        return check_calibration(views, refined, OPTIONS, replace(Priors.none(), witness=witness))
+
+    confirmed, contradicted = check(truth), check(refined.poses)
+    assert confirmed.alarm
+    assert not confirmed.contradicted
+    assert contradicted.contradicted
+    assert contradicted.errors["focal"] == pytest.approx(0.06, abs=0.01)
+    assert not contradicted.alarm
+    assert not contradicted.is_likely
 
 
 def test_correct_camera_raises_no_alarm():

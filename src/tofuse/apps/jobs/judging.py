@@ -17,7 +17,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -196,7 +196,7 @@ def judge(
     progress = progress or Silent()
     if tolerance_m is not None:
         check_number(tolerance_m, Bounds(0, exclusive=True), "tolerance_m")
-    poses = poses_for(recording, trajectory)
+    given_poses = poses_for(recording, trajectory)
     kind = reconstructing.view_kind(recording)
     # External sensors do not measure these poses, and images are compared with the stated camera.
     config = replace(
@@ -206,77 +206,29 @@ def judge(
         config, odometry=given.GivenPoses(), refinement=Joint(neighbours=_NEIGHBOURS)
     )
     check_views(given_config, kind)
-
-    sample = _sample_of(recording, poses)
-    rows = np.searchsorted(recording.indices, sample.indices)
-
-    @cache
-    def view(k: int) -> PreparedView | None:
-        frame = sample.image(k)
-        return None if frame is None else cross_view_agreement.prepare_for_comparison(frame)
-
-    def views_at(poses: Float64) -> dict[int, PreparedView]:
-        posed = evenly_spaced(np.flatnonzero(np.isfinite(poses).all((1, 2))), _COMPARED).tolist()
-        return {k: found for k in posed if (found := view(k)) is not None}
-
-    def compared_at(poses: Float64) -> cross_view_agreement.CrossViewConsistency:
-        views = views_at(poses)
-        return cross_view_agreement.compare_views(list(views.values()), poses[list(views)])
-
-    def reconstructed(source: Recording, config: Config) -> tuple[Reconstruction, Views]:
-        return reconstructing.reconstruct_with_views(
-            source, config, threads=threads, progress=progress
-        )
-
+    images = _Images(_sample_of(recording, given_poses), recording)
     with use_threads(threads), threadpool_limits(1):
         progress.stage("comparing images")
-        as_given = compared_at(poses[rows])
-        unsupported = _support(as_given) < _SUPPORTED
-        compared = views_at(poses[rows])
-        pairs = list(compared.values()), poses[rows][list(compared)]
-        estimate = pose_scale.first_scale(*pairs)
-        if scale or (unsupported if estimate is None else estimate.is_other_unit):
-            estimate = pose_scale.estimated_scale(*pairs)
-        if scale and estimate is None:
-            raise InputError(
-                "can't be estimated: too few views with translation between them fit",
-                where="scale",
-                remedy="leave out --scale, or pass poses of more frames",
-            )
-        if estimate is not None and (scale or estimate.is_other_unit):
-            multiplied = pose_scale.with_scale(poses, estimate.factor)
-            as_scaled = compared_at(multiplied[rows])
-            if scale or _support(as_scaled) > _support(as_given):
-                poses, as_given, estimate = multiplied, as_scaled, replace(estimate, applied=True)
-                unsupported = _support(as_given) < _SUPPORTED
+        poses, estimate = _in_metres(images, given_poses, required=scale)
+        as_given = images.compared_at(poses[images.rows])
         given_config = adaptation.adapted(given_config, recording, threads, progress, _TRIAL_RUNS)
-    sampled, views = reconstructed(adaptation.with_odometry(sample, poses[rows]), given_config)
-    refined_poses = _propagated(poses, rows, sampled.trajectory)
-    as_refined, started = as_given, True
-    if unsupported:
-        if finding := convention_of(recording, poses):
-            progress.note(str(finding))
-        as_refined = compared_at(sampled.trajectory)
-    if _support(as_refined) < _SUPPORTED:
-        tracked, tracked_views = reconstructed(recording, config)
-        as_tracked = compared_at(tracked.trajectory[rows])
-        if _support(as_tracked) > _support(as_refined):
-            sampled, views, as_refined, started = tracked, tracked_views, as_tracked, False
-            refined_poses = tracked.trajectory
+    refined = _refined(images, poses, as_given, (given_config, config), threads, progress)
     progress.stage("registering pairs")
-    row_of = {int(index): k for k, index in enumerate(recording.indices)}
     with use_threads(threads), threadpool_limits(1):
-        used = _common(views, poses, refined_poses, row_of, set(sample.indices.tolist()))
-        deviation = _deviation(poses, refined_poses, used, row_of)
+        used = _common(
+            refined.views, poses, refined.poses, images.row_of, set(images.sample.indices.tolist())
+        )
+        deviation = _deviation(poses, refined.poses, used, images.row_of)
         cause = None
         if deviation is not None:
-            velocity = _velocities(recording, poses)[[row_of[v.index] for v in used]]
+            velocity = _velocities(recording, poses)[[images.row_of[v.index] for v in used]]
             cause = pose_causes.cause_of(deviation, velocity)
         consistency, refined_consistency = _consistencies(
-            sample, deviation, poses[rows], refined_poses[rows]
+            images.sample, deviation, poses[images.rows], refined.poses[images.rows]
         )
-    distances = _distances(poses, refined_poses)
-    accuracy = _accuracy(distances, poses, refined_poses, deviation, sampled, recording.indices)
+    sampled = refined.result
+    distances = _distances(poses, refined.poses)
+    accuracy = _accuracy(distances, poses, refined.poses, deviation, sampled, recording.indices)
     stated = _stated_accuracy(trajectory)
     if stated is not None and _holds(stated, accuracy, sampled.diagnostics.accuracy, deviation):
         accuracy = stated
@@ -285,16 +237,17 @@ def judge(
             *_reasons(
                 recording,
                 poses,
-                refined_poses,
+                refined.poses,
                 accuracy,
                 (deviation, cause),
-                (as_given, as_refined),
+                (as_given, refined.compared),
                 checks.tolerance_of(tolerance_m, sampled.cloud.diagonal_m),
             )
         ]
     )
 
     def reconstruct() -> Reconstruction:
+        started = refined.started
         source = adaptation.with_odometry(recording, poses) if started else recording
         config_used = replace(given_config, refinement=config.refinement) if started else config
         return reconstructing.reconstruct(source, config_used, threads=threads, progress=progress)
@@ -309,11 +262,140 @@ def judge(
         deviation,
         distances,
         sampled,
-        started,
+        refined.started,
         estimate,
         cause,
         _reconstruct=reconstruct,
     )
+
+
+class _Images:
+    """The images of a sample of a recording's frames, to compare them at poses (V, 4, 4).
+
+    Attributes
+    ----------
+    sample, rows
+        The sample, and the rows of its frames in the recording.
+    row_of
+        Row of each frame of the recording.
+    """
+
+    def __init__(self, sample: Recording, recording: Recording) -> None:
+        self.sample, self.recording = sample, recording
+        self.rows = np.searchsorted(recording.indices, sample.indices)
+        self.row_of = {int(index): k for k, index in enumerate(recording.indices)}
+        self._prepared: dict[int, PreparedView | None] = {}
+
+    def views_at(self, poses: Float64) -> tuple[list[PreparedView], Float64]:
+        """Return views of frames that have a pose, and their poses."""
+        posed = evenly_spaced(np.flatnonzero(np.isfinite(poses).all((1, 2))), _COMPARED).tolist()
+        views = {k: found for k in posed if (found := self._view(k)) is not None}
+        return list(views.values()), poses[list(views)]
+
+    def compared_at(self, poses: Float64) -> cross_view_agreement.CrossViewConsistency:
+        """Compare the images."""
+        return cross_view_agreement.compare_views(*self.views_at(poses))
+
+    def _view(self, k: int) -> PreparedView | None:
+        if k not in self._prepared:
+            frame = self.sample.image(k)
+            view = None if frame is None else cross_view_agreement.prepare_for_comparison(frame)
+            self._prepared[k] = view
+        return self._prepared[k]
+
+
+def _in_metres(
+    images: _Images, poses: Float64, *, required: bool
+) -> tuple[Float64, pose_scale.PoseScale | None]:
+    """Return poses in metres, and their scale, if it was estimated.
+
+    It is applied if that is `required`, or if it can't be that of metres and the images agree
+    better with it.
+    """
+    pairs = images.views_at(poses[images.rows])
+    as_given = _support(images.compared_at(poses[images.rows]))
+    estimate = pose_scale.first_scale(*pairs)
+    if required or (as_given < _SUPPORTED if estimate is None else estimate.is_other_unit):
+        estimate = pose_scale.estimated_scale(*pairs)
+    if required and estimate is None:
+        raise InputError(
+            "can't be estimated: too few views with translation between them fit",
+            where="scale",
+            remedy="leave out --scale, or pass poses of more frames",
+        )
+    if estimate is None or not (required or estimate.is_other_unit):
+        return poses, estimate
+    multiplied = pose_scale.with_scale(poses, estimate.factor)
+    if required or _support(images.compared_at(multiplied[images.rows])) > as_given:
+        return multiplied, replace(estimate, applied=True)
+    return poses, estimate
+
+
+@dataclass(frozen=True, eq=False)
+class _Refined:
+    """Poses refined from the given ones, or tracked anew.
+
+    Attributes
+    ----------
+    poses
+        (N, 4, 4) of all frames.
+    result, views
+        The reconstruction, of the sample if `started`.
+    compared
+        The images at these poses.
+    started
+        Whether they were refined from the given ones.
+    """
+
+    poses: Float64
+    result: Reconstruction
+    views: Views
+    compared: cross_view_agreement.CrossViewConsistency
+    started: bool
+
+
+def _refined(
+    images: _Images,
+    poses: Float64,
+    as_given: cross_view_agreement.CrossViewConsistency,
+    configs: tuple[Config, Config],
+    threads: int | None,
+    progress: Progress,
+) -> _Refined:
+    """Refine the given poses; where images don't support them, track instead if that is better.
+
+    Parameters
+    ----------
+    images, poses, as_given
+        The images, poses (N, 4, 4) of all frames, and the comparison at these.
+    configs
+        To refine given poses, and to track.
+    threads, progress
+        As for `judge`.
+    """
+    recording, sample, rows = images.recording, images.sample, images.rows
+    result, views = reconstructing.reconstruct_with_views(
+        adaptation.with_odometry(sample, poses[rows]),
+        configs[0],
+        threads=threads,
+        progress=progress,
+    )
+    refined_poses = _propagated(poses, rows, result.trajectory)
+    refined = _Refined(refined_poses, result, views, as_given, True)
+    if _support(as_given) >= _SUPPORTED:
+        return refined
+    if finding := convention_of(recording, poses):
+        progress.note(str(finding))
+    refined = replace(refined, compared=images.compared_at(result.trajectory))
+    if _support(refined.compared) >= _SUPPORTED:
+        return refined
+    tracked, views = reconstructing.reconstruct_with_views(
+        recording, configs[1], threads=threads, progress=progress
+    )
+    as_tracked = images.compared_at(tracked.trajectory[rows])
+    if _support(as_tracked) > _support(refined.compared):
+        return _Refined(tracked.trajectory, tracked, views, as_tracked, False)
+    return refined
 
 
 @dataclass

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Annotated, ClassVar, Protocol
 
 import numpy as np
@@ -105,6 +105,8 @@ class SensorPriors:
         See `Gravity.gate`.
     records
         One for each sensor, for the report.
+    witness
+        Steps of verified odometry that poses are compared with, but which don't change them.
     """
 
     steps: tuple[Measured, ...] = ()
@@ -114,6 +116,7 @@ class SensorPriors:
     records: tuple[SensorRecord, ...] = ()
     verified: bool = False
     depth_scale: tuple[float, float] = (1.0, 1.0)
+    witness: tuple[Measured, ...] = ()
 
     def __bool__(self) -> bool:
         return bool(self.steps or self.ids)
@@ -153,19 +156,31 @@ class SensorPriors:
         length = float(np.linalg.norm(up))
         return up / length if length > 0.1 else None
 
+    def witnessed(self, ids: Sequence[int]) -> Float64 | None:
+        """(N, 4, 4) T_first_frame of ascending frames by the witness; None if it has gaps."""
+        steps = _between(self.witness, ids)
+        if not steps or len(steps) < len(ids) - 1:
+            return None
+        motions = accumulate((step.T_i_j for step in steps), np.matmul, initial=np.eye(4))
+        return np.array(list(motions))
+
     def between(self, ids: Sequence[int]) -> list[Measured]:
         """Relative poses of successive frames of `ids` (ascending) without gaps between them."""
-        step_from = {step.i: step for step in self.steps}
-        out = []
-        for i, j in pairwise(ids):
-            T, C, frame = np.eye(4), np.zeros((6, 6)), i
-            while frame in step_from and frame < j:
-                step = step_from[frame]
-                T, frame = T @ step.T_i_j, step.j
-                C += np.linalg.inv(step.information)
-            if frame == j:
-                out.append(Measured(i, j, T, np.asarray(np.linalg.inv(C), np.float64)))
-        return out
+        return _between(self.steps, ids)
+
+
+def _between(steps: Sequence[Measured], ids: Sequence[int]) -> list[Measured]:
+    step_from = {step.i: step for step in steps}
+    out = []
+    for i, j in pairwise(ids):
+        T, C, frame = np.eye(4), np.zeros((6, 6)), i
+        while frame in step_from and frame < j:
+            step = step_from[frame]
+            T, frame = T @ step.T_i_j, step.j
+            C += np.linalg.inv(step.information)
+        if frame == j:
+            out.append(Measured(i, j, T, np.asarray(np.linalg.inv(C), np.float64)))
+    return out
 
 
 class ExternalSensor(Protocol):

@@ -12,6 +12,7 @@ from tofuse.engine.frames import RangeFrame, frame_ranges
 from tofuse.engine.fusion import Model, with_pose_errors
 from tofuse.engine.graph import LoopRecord, Measured, PoseGraph, external_sensors, graph_covariances
 from tofuse.engine.loops import PriorLoop, cut_edges
+from tofuse.engine.mapping import camera_uncertainty
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.observations import Observations
@@ -23,7 +24,7 @@ from tofuse.engine.quality import (
     pose_accuracy,
     trajectory_errors,
 )
-from tofuse.engine.refinement import Refinement, calibration_check
+from tofuse.engine.refinement import Refinement
 from tofuse.engine.results import Component, FrameRecord, Reason, Verdict, checks, verdicts
 from tofuse.engine.sensor import CameraErrors
 from tofuse.engine.tracking import FrameTime, given, moving_objects
@@ -99,9 +100,10 @@ class Assessment:
         cross_view = self._cross_view(graph)
         accuracy, covariances = self._accuracy(closed, refined, model, cross_view)
         rms_m = np.nan if cross_view is None else cross_view.rms_m()
+        check, corrections = refined.refinement.calibration_check, self._estimated_corrections
         accuracy = replace(
             accuracy,
-            camera_sigmas=self._camera_sigmas(refined.refinement.calibration_check),
+            camera_sigmas={} if check is None else camera_uncertainty.sigmas(check, corrections),
             surface_m=rms_m if np.isfinite(rms_m) else None,
         )
         moving = tuple(
@@ -186,42 +188,34 @@ class Assessment:
             claimed = closed.visual.optimisation.graph
             if refinement.kept:
                 claimed = self.tracked.build(closed.loops, refinement, confirmed=closed.confirmed)
-        covariances = graph_covariances.GraphCovariances(self._measured(claimed, refinement))
-        refinement_shift = 0.0, 0.0
-        if self._is_tracked:  # the initial error of given poses is unrelated to the final one
-            refinement_shift = trajectory_errors.displacement(
-                closed.optimisation.graph.poses, refined.graph.poses
+        measured = self._measured(claimed, refinement)
+        observed = self._observed_errors(closed, refined, cross_view)
+
+        def assessed(
+            steps: Sequence[Measured],
+        ) -> tuple[pose_accuracy.Accuracy, graph_covariances.GraphCovariances]:
+            graph = external_sensors.with_sensors(
+                measured, external_sensors.SensorPriors(tuple(steps))
             )
-        excess_m = 0.0 if cross_view is None else cross_view.excess_m()
-        calibration = self._calibration_error(refinement.calibration_check)
-        observed = pose_accuracy.ObservedErrors(
-            *refinement_shift,
-            excess_m,
-            *calibration,
-            refinement.split_m,
-            refinement.split_rad,
-            corrected=bool(self._estimated_corrections),
-        )
-        accuracy = pose_accuracy.accuracy_of(covariances, observed, model.cloud.diagonal_m)
-        graph = covariances.graph
-
-        def bounded_by(steps: tuple[Measured, ...]) -> tuple[int, ...]:
-            """Add steps to the graph, and return the frames that they bound."""
-            nonlocal accuracy, covariances, graph
-            graph = external_sensors.with_sensors(graph, external_sensors.SensorPriors(steps))
             covariances = graph_covariances.GraphCovariances(graph)
-            unbounded = set(accuracy.unbounded)
-            accuracy = pose_accuracy.accuracy_of(covariances, observed, model.cloud.diagonal_m)
-            return tuple(sorted(unbounded.difference(accuracy.unbounded)))
+            bounds = pose_accuracy.accuracy_of(covariances, observed, model.cloud.diagonal_m)
+            return bounds, covariances
 
-        by_odometry: tuple[int, ...] = ()
-        by_motion: tuple[int, ...] = ()
+        steps: tuple[Measured, ...] = ()
+        accuracy, covariances = assessed(steps)
+        by_images = accuracy
         if accuracy.unbounded and closed.sensors.verified:
-            by_odometry = bounded_by(self.tracked.steps_at_degenerate(closed.sensors))
+            steps = self.tracked.steps_at_degenerate(closed.sensors)
+            accuracy, covariances = assessed(steps)
+        by_sensors = accuracy
         between = self.tracked.steps_at_unbounded(claimed, accuracy.unbounded)
         if between:
-            by_motion = bounded_by(between)
-        accuracy = replace(accuracy, by_odometry=by_odometry, by_motion=by_motion)
+            accuracy, covariances = assessed([*steps, *between])
+        accuracy = replace(
+            accuracy,
+            by_odometry=_bounded_since(by_images, by_sensors),
+            by_motion=_bounded_since(by_sensors, accuracy),
+        )
         if closed.sensors:
             del covariances  # only one large factor is in memory
             graph = external_sensors.with_sensors(
@@ -229,6 +223,28 @@ class Assessment:
             )
             covariances = graph_covariances.GraphCovariances(graph)
         return accuracy, pose_accuracy.covariances_of(covariances, observed)
+
+    def _observed_errors(
+        self,
+        closed: Optimised,
+        refined: Refined,
+        cross_view: cross_view_agreement.CrossViewConsistency | None,
+    ) -> pose_accuracy.ObservedErrors:
+        """Return the errors of the poses that their covariances don't include."""
+        refinement, corrections = refined.refinement, self._estimated_corrections
+        shift = 0.0, 0.0
+        if self._is_tracked:  # the initial error of given poses is unrelated to the final one
+            shift = trajectory_errors.displacement(
+                closed.optimisation.graph.poses, refined.graph.poses
+            )
+        excess_m = 0.0 if cross_view is None else cross_view.excess_m()
+        calibration = 0.0, 0.0
+        if refinement.calibration_check is not None:
+            calibration = camera_uncertainty.pose_errors(refinement.calibration_check, corrections)
+        split = refinement.split_m, refinement.split_rad
+        return pose_accuracy.ObservedErrors(
+            *shift, excess_m, *calibration, *split, corrected=bool(corrections)
+        )
 
     def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:
         return self.tracked.measured(graph, self.observations.views, refinement.non_overlap_edges)
@@ -238,60 +254,6 @@ class Assessment:
         """The corrections of the camera that were estimated from its own views."""
         corrections = [c for c in self.config.corrections if isinstance(c, CameraErrors)]
         return [c for c in corrections if any(c.sigmas.values())]
-
-    def _calibration_error(
-        self, check: calibration_check.CalibrationCheck | None
-    ) -> tuple[float, float]:
-        """Return the rms of the pose errors (m, rad) due to the calibration.
-
-        The poses change with an estimated calibration, which multipath causes too: only an error
-        that may well be true counts in full. Where the views don't determine the focal length, its
-        error may be that of usual cameras. Added are the uncertainty of corrections and the gap of
-        a loop that a better calibration would close.
-        """
-        if check is None:
-            return 0.0, 0.0
-        unknown = np.sqrt(pose_accuracy.UNKNOWN_FRACTION)
-        errors = [
-            (1.0 if check.is_likely else unknown) * np.array(check.moved),
-            np.array(check.changed),
-        ]
-        if check.undetermined:
-            usual = calibration_check.TOLERANCES["focal"]
-            errors.append(unknown * usual * np.array(check.motion["focal"]))
-        if check.alarm and check.gap is not None:
-            errors.append(np.array(check.gap.before))
-        for part in self._estimated_corrections:
-            for name, motion in check.motion.items():
-                errors.append(part.sigmas[name] * np.array(motion))
-                if part.errors[name]:  # as of usual cameras, by what all views have in common
-                    usual = calibration_check.TOLERANCES[name]
-                    errors.append(unknown * usual * np.array(motion))
-        m, rad = np.linalg.norm(errors, axis=0).tolist()
-        return m, rad
-
-    def _camera_sigmas(self, check: calibration_check.CalibrationCheck | None) -> dict[str, float]:
-        """Return the standard deviations of the focal length and of the range offset.
-
-        That of the focal length is that of usual cameras, as far as the views don't know better; it
-        stands for an offset that they don't determine. An estimated error that was not corrected
-        counts as in the errors of the poses.
-        """
-        if check is None:
-            return {}
-        unknown = np.sqrt(pose_accuracy.UNKNOWN_FRACTION)
-        sigmas = {}
-        for name in ("focal", "offset"):
-            tolerance = calibration_check.TOLERANCES[name]
-            error, sigma = check.estimates.get(name, (0.0, np.inf))
-            corrections = [part.sigmas[name] for part in self._estimated_corrections]
-            shown = max(corrections, default=0.0)
-            if not corrections and check.determines(name):
-                shown = (1.0 if check.is_likely and name in check.errors else unknown) * abs(error)
-            known = float(1 / np.hypot(1 / tolerance, 1 / sigma))
-            if name == "focal" or shown > 0:
-                sigmas[name] = float(np.hypot(shown, known))
-        return sigmas
 
     def _with_pose_errors(self, model: Model, graph: PoseGraph, covariances: Float64) -> Model:
         """Add the errors of the poses, with covariances (P, 6, 6), to those of the model."""
@@ -362,6 +324,13 @@ class Assessment:
         if model.mesh is None:
             text = "Clouds without a camera make no surface: there is no mesh.ply and no mesh.glb."
         return (Reason("no_surface", self._whole_recording, text),)
+
+
+def _bounded_since(
+    before: pose_accuracy.Accuracy, after: pose_accuracy.Accuracy
+) -> tuple[int, ...]:
+    """Return the frames that are unbounded before, but not after more was measured."""
+    return tuple(sorted(set(before.unbounded).difference(after.unbounded)))
 
 
 def single_link_frames(tracked: TrackedGraph, loops: Sequence[LoopRecord]) -> tuple[int, ...]:

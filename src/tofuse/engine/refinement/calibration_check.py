@@ -116,6 +116,8 @@ class CalibrationCheck:
         `significance_of`.
     range_change
         Change of the range over the views, if there is one; then no error is estimated.
+    contradicted
+        Whether recorded odometry contradicts the error `best`.
     """
 
     alarm: bool = False
@@ -131,6 +133,7 @@ class CalibrationCheck:
     changed: tuple[float, float] = (0.0, 0.0)
     significance: float = SIGNIFICANT
     range_change: RangeChange | None = None
+    contradicted: bool = False
 
     @property
     def undetermined(self) -> bool:
@@ -145,10 +148,10 @@ class CalibrationCheck:
     def unconfirmed(self) -> dict[str, float]:
         """Significant errors without an alarm that may be true.
 
-        Either one of them is large, and no loop confirms or contradicts it, or the views agree
-        better with the smaller ones.
+        Either one of them is large, and neither a loop nor odometry confirms or contradicts it, or
+        the views agree better with the smaller ones.
         """
-        if self.alarm or (self.gap is not None and self.gap.contradicts):
+        if self.alarm or self.contradicted or (self.gap is not None and self.gap.contradicts):
             return {}
         if not self.large and not self.improves:
             return {}
@@ -157,7 +160,7 @@ class CalibrationCheck:
     @property
     def is_likely(self) -> bool:
         """Whether the estimated errors may well be true."""
-        return bool(self.unconfirmed or (self.improves and self.large))
+        return bool(self.unconfirmed or (self.improves and self.large and not self.contradicted))
 
     @property
     def improves(self) -> bool:
@@ -234,13 +237,14 @@ def check_calibration(
     gap = None
     if large or improves:
         gap = loop_gap(views, refined, best.poses, best.errors, options)
+    contradicted = (large or improves) and estimator.is_contradicted(best)
     # Multipath has the same effect as a smaller error: views agree better, and a loop closes.
-    alarm = large and improves and gap is not None and gap.closes
+    alarm = large and improves and gap is not None and gap.closes and not contradicted
     if alarm:  # alternative explanations
         for name in first.determined:
             if name not in errors:
                 errors[name] = float(estimator.estimate([name]).errors[_INDEX[name]])
-    else:
+    elif not contradicted:
         by_loop = _check_by_loop(views, refined, first, without_error, options)
         if by_loop.alarm:
             return by_loop
@@ -256,6 +260,7 @@ def check_calibration(
         gap=gap,
         best=best_name,
         moved=max(largest, first.largest_motion),
+        contradicted=contradicted,
     )
 
 
@@ -322,13 +327,13 @@ class _FirstEstimates:
 
     @property
     def largest_motion(self) -> tuple[float, float]:
-        """Largest rms motion (m, rad) of the poses by a determined error or a likely change."""
+        """Largest rms motion (m, rad) of the poses by an error that the views determine."""
         motions = [
             (m * abs(self.errors[name]), rad * abs(self.errors[name]))
             for name, (m, rad) in self.motion.items()
             if name in self.determined
         ]
-        return max([*motions, self.change_motion])
+        return max(motions, default=(0.0, 0.0))
 
 
 class _Estimator:
@@ -352,6 +357,7 @@ class _Estimator:
         self._views, self._first = views, first
         self._options = replace(thinned_options, rounds=COARSE_TO_FINE[-1:])
         self._align = partial(align_views, views, priors=priors, pairs=pairs)
+        self._witness = priors.witness
         self._poses = self._align(refined.poses, replace(self._options, rounds=_REALIGNMENT)).poses
 
     def estimate(self, names: Sequence[str]) -> AlignedViews:
@@ -366,6 +372,21 @@ class _Estimator:
             poses = poses @ se3.exp(first.errors[name] * first.follow[name])
         calibrate = [_INDEX[name] for name in names]
         return self._align(poses, options, calibrate=calibrate, errors=errors)
+
+    def is_contradicted(self, estimate: AlignedViews) -> bool:
+        """Whether poses with the errors of an estimate differ more from odometry, if there is any.
+
+        As of the gap of a loop, only a difference beyond noise counts.
+        """
+        if self._witness is None:
+            return False
+        depth = float(np.median([view.depth for view in self._views]))
+        before, after = (
+            aligned_motion(self._witness, se3.inverse(poses[0]) @ poses)
+            for poses in (self._poses, estimate.poses)
+        )
+        rms = [(_rms(position), _rms(rotation)) for position, rotation in (before, after)]
+        return Gap(0, len(self._poses) - 1, rms[0], rms[1], depth).widens
 
     def support_of(self, estimate: AlignedViews) -> tuple[float, float]:
         """Mean support of the views without and with the errors of an estimate."""

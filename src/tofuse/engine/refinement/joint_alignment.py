@@ -36,12 +36,15 @@ class Priors:
         (M, 2) positions i, j of views, (M, 4, 4) T_i_j and (M, 6, 6) its information.
     gravity
         Directions of gravity, or None.
+    witness
+        (N, 4, 4) T_first_view of all views by odometry that the result is compared with, or None.
     """
 
     pairs: Intp
     measured: Float64
     information: Float64
     gravity: external_sensors.Gravity | None = None
+    witness: Float64 | None = None
 
     @classmethod
     def none(cls) -> Priors:

@@ -105,10 +105,14 @@ class Gap:
 
         Errors of the camera hardly change the gap of a short loop, which does not reveal them.
         """
-        before = self._apparent_m(*self.before)
-        changes = self._apparent_m(*self.change) > 0.5 * before
-        widens = self.remaining_m > before + self._apparent_m(*_MAX_CLOSURE_ERROR)
-        return self.significant and not self.closes and (changes or widens)
+        changes = self._apparent_m(*self.change) > 0.5 * self._apparent_m(*self.before)
+        return self.significant and not self.closes and (changes or self.widens)
+
+    @property
+    def widens(self) -> bool:
+        """Whether the estimated errors make it larger, by more than noise."""
+        limit = self._apparent_m(*_MAX_CLOSURE_ERROR)
+        return self.remaining_m > self._apparent_m(*self.before) + limit
 
 
 def loop_gap(

@@ -360,6 +360,7 @@ def _priors(ids: Sequence[int], measured: external_sensors.SensorPriors) -> Prio
         np.array([s.T_i_j for s in steps]).reshape(m, 4, 4),
         np.array([s.information * _CORRELATED_PIXELS for s in steps]).reshape(m, 6, 6),
         gravity,
+        measured.witnessed(ids),
     )
 
 
