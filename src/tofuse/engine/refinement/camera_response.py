@@ -126,7 +126,7 @@ class Linearised:
         pair_equations.without_exposure(state)
         pair_equations.rescale(state, stage, options)
         pair_equations.evaluate(views, poses, zero_errors, estimate_all, state, stage, options)
-        H, g = pair_equations.without_exposure(state)
+        H, g = pair_equations.without_exposure(state, range(kernels.ERRORS))
         i, j = system.pairs.T
         T_i_j = se3.inverse(poses[i]) @ poses[j]
         prior_H, prior_g = priors.equations(T_i_j[len(H) :])

@@ -461,7 +461,6 @@ def _pairwise_measurements(
 ) -> tuple[Float64, Float64]:
     """Measurement T_i_j of each pair alone, and its information."""
     H, g = pair_equations.without_exposure(state)
-    H, g = H[:, :6, :6], g[:, :6]
     count = len(pairs)
     T_i_j = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
     # A perturbation of T_i_j is the opposite one of T_j_i, in the other frame.
@@ -496,7 +495,8 @@ def _solve(
     bodies: Bodies | None = None,
 ) -> tuple[Float64, Float64]:
     """One Gauss-Newton step: (N, 6) right perturbations of views or bodies, and of the errors."""
-    H, g = pair_equations.without_exposure(state)
+    estimated = np.flatnonzero(fixed_errors == 0)
+    H, g = pair_equations.without_exposure(state, estimated.tolist())
     if bodies is not None:
         # A perturbation of the body is one of its view, by the adjoint.
         A = np.tile(np.eye(H.shape[1]), (len(H), 1, 1))
@@ -504,7 +504,6 @@ def _solve(
         At = np.swapaxes(A, 1, 2)
         H, g = At @ H @ A, (At @ g[..., None])[..., 0]
         poses = bodies.body_poses(poses)
-    error_columns = 6 + np.flatnonzero(fixed_errors == 0)
     n, prior_count = len(poses), len(priors.pairs)
     i, j = system.pairs.T
     T_i_j = se3.inverse(poses[i]) @ poses[j]
@@ -513,10 +512,10 @@ def _solve(
     shared = _SharedUnknowns(
         [
             system.gradient(np.concatenate([H[:, :6, k], np.zeros((prior_count, 6))]), T_i_j)
-            for k in error_columns
+            for k in range(6, H.shape[1])
         ],
-        H[:, error_columns[:, None], error_columns].sum(0),
-        g[:, error_columns].sum(0),
+        H[:, 6:, 6:].sum(0),
+        g[:, 6:].sum(0),
     )
     damping = WEAK / _ERROR_UNIT**2 + DAMPING * shared.H.diagonal()
     if priors.gravity is not None:
@@ -539,7 +538,7 @@ def _solve(
     schur[np.diag_indices(len(coupling))] += damping
     shared_step = -np.linalg.solve(schur, reduced_gradient)
     errors = np.zeros(kernels.ERRORS)
-    errors[error_columns - 6] = shared_step[: len(error_columns)]
+    errors[estimated] = shared_step[: len(estimated)]
     return step + np.tensordot(shared_step, response, 1), errors
 
 

@@ -28,7 +28,10 @@ _PAIRS_A_CHUNK = 8
 _PAIRS_SAMPLED = 200
 # Residuals that an estimate of scale needs.
 _MIN_COMPARED = 50
-_UPPER = np.triu_indices(kernels.UNKNOWNS)
+# Column of the product of two unknowns in the rows of pairs.
+_PRODUCT = np.zeros((kernels.UNKNOWNS, kernels.UNKNOWNS), np.intp)
+_PRODUCT[np.triu_indices(kernels.UNKNOWNS)] = np.arange(kernels.PRODUCTS, kernels.GRADIENT)
+_PRODUCT = np.maximum(_PRODUCT, _PRODUCT.T)
 
 
 @dataclass(frozen=True)
@@ -284,27 +287,30 @@ def discount_shared(
     run_chunks(work, len(photometric), -(-len(photometric) // _PAIRS_A_CHUNK))
 
 
-def without_exposure(state: DirectedPairs) -> tuple[Float64, Float64]:
+def without_exposure(state: DirectedPairs, errors: Sequence[int] = ()) -> tuple[Float64, Float64]:
     """Return normal equations of each pair without its exposure, which is eliminated and updated.
+
+    Parameters
+    ----------
+    state
+        The pairs, after `evaluate`.
+    errors
+        E errors of the camera, by their number in `kernels`.
 
     Returns
     -------
-    (P, 6 + ERRORS, 6 + ERRORS) matrices and (P, 6 + ERRORS) gradients, of the right perturbation
-    of T_target_source and the errors of the camera.
+    (P, 6 + E, 6 + E) matrices and (P, 6 + E) gradients, of the right perturbation of
+    T_target_source and these errors.
     """
-    m, e = len(state.target), kernels.EXPOSURE
-    H = np.zeros((m, kernels.UNKNOWNS, kernels.UNKNOWNS))
-    H[:, _UPPER[0], _UPPER[1]] = state.rows[:, kernels.PRODUCTS : kernels.GRADIENT]
-    H[:, _UPPER[1], _UPPER[0]] = state.rows[:, kernels.PRODUCTS : kernels.GRADIENT]
-    g = state.rows[:, kernels.GRADIENT : kernels.GRADIENT + kernels.UNKNOWNS]
-    pivot = np.maximum(H[:, e, e], 1e-9)
-    state.exposure -= np.clip(g[:, e] / pivot, -0.3, 0.3)
-    kept = np.delete(np.arange(kernels.UNKNOWNS), e)
-    ratio = H[:, kept, e] / pivot[:, None]
-    return (
-        H[:, kept[:, None], kept] - ratio[:, :, None] * H[:, None, e, kept],
-        g[:, kept] - ratio * g[:, [e]],
-    )
+    kept = np.array([*range(6), *(7 + k for k in errors)], np.intp)
+    rows, e = state.rows, kernels.EXPOSURE
+    pivot = np.maximum(rows[:, _PRODUCT[e, e]], 1e-9)
+    gradient = rows[:, kernels.GRADIENT + e]
+    state.exposure -= np.clip(gradient / pivot, -0.3, 0.3)
+    coupling = rows[:, _PRODUCT[kept, e]]
+    ratio = coupling / pivot[:, None]
+    H = rows[:, _PRODUCT[np.ix_(kept, kept)]] - ratio[:, :, None] * coupling[:, None]
+    return H, rows[:, kernels.GRADIENT + kept] - ratio * gradient[:, None]
 
 
 def rescale(state: DirectedPairs, stage: Round, options: RefineOptions) -> None:
