@@ -84,6 +84,16 @@ def bound_of(*errors: float, **named: float) -> Accuracy:
     return accuracy_of(GraphCovariances(walk()), ObservedErrors(*errors, **named), 1.0)
 
 
+def test_errors_of_the_camera_are_measured_by_odometry():
+    observed = ObservedErrors(0.03, 0.02, 0.04, 0.05, 0.06, 0.07, 0.08)
+    by_odometry = observed.of_other_sensors().mean_squares(np.array([1e-4, 1e-5]))
+    np.testing.assert_array_equal(by_odometry["noise"], [1e-4, 1e-5])
+    assert not by_odometry["calibration"].any()
+    by_images = observed.mean_squares(np.zeros(2))
+    for cause in ("refinement", "disagreement"):
+        np.testing.assert_array_equal(by_odometry[cause], by_images[cause])
+
+
 def test_errors_shown_by_recording_are_added_as_variances() -> None:
     plain = bound_of()
     assert plain.limited_by == "noise"

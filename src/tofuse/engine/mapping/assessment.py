@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.frames import RangeFrame, frame_ranges
 from tofuse.engine.fusion import Model, with_pose_errors
-from tofuse.engine.graph import LoopRecord, Measured, PoseGraph, external_sensors, graph_covariances
+from tofuse.engine.graph import LoopRecord, PoseGraph, external_sensors, graph_covariances
 from tofuse.engine.loops import PriorLoop, cut_edges
 from tofuse.engine.mapping import camera_uncertainty
 from tofuse.engine.mapping.config import Config
@@ -182,47 +182,49 @@ class Assessment:
             return pose_accuracy.Accuracy(), graph_covariances.GraphCovariances(
                 closed.optimisation.graph
             ).of_poses
-        refinement = refined.refinement
-        claimed = refined.graph
-        if closed.sensors:  # the accuracy uses the images alone where they suffice
-            claimed = closed.visual.optimisation.graph
-            if refinement.kept:
-                claimed = self.tracked.build(closed.loops, refinement, confirmed=closed.confirmed)
-        measured = self._measured(claimed, refinement)
         observed = self._observed_errors(closed, refined, cross_view)
 
+        claimed = self._by_images(closed, refined)
+        measured = self._measured(claimed, refined.refinement).with_poses(refined.graph.poses)
+
         def assessed(
-            steps: Sequence[Measured],
+            sensors: external_sensors.SensorPriors, observed: pose_accuracy.ObservedErrors
         ) -> tuple[pose_accuracy.Accuracy, graph_covariances.GraphCovariances]:
-            graph = external_sensors.with_sensors(
-                measured, external_sensors.SensorPriors(tuple(steps))
-            )
+            graph = external_sensors.with_sensors(measured, sensors)
             covariances = graph_covariances.GraphCovariances(graph)
             bounds = pose_accuracy.accuracy_of(covariances, observed, model.cloud.diagonal_m)
             return bounds, covariances
 
-        steps: tuple[Measured, ...] = ()
-        accuracy, covariances = assessed(steps)
+        sensors = external_sensors.SensorPriors()
+        accuracy, covariances = assessed(sensors, observed)
         by_images = accuracy
-        if accuracy.unbounded and closed.sensors.verified:
-            steps = self.tracked.steps_at_degenerate(closed.sensors)
-            accuracy, covariances = assessed(steps)
+        if closed.sensors.verified:
+            # Compared with odometry, all errors of the depth were measured, whatever their cause.
+            sensors, observed = closed.sensors, observed.of_other_sensors()
+            accuracy, covariances = assessed(sensors, observed)
         by_sensors = accuracy
         between = self.tracked.steps_at_unbounded(claimed, accuracy.unbounded)
         if between:
-            accuracy, covariances = assessed([*steps, *between])
+            sensors = replace(sensors, steps=(*sensors.steps, *between))
+            accuracy, covariances = assessed(sensors, observed)
         accuracy = replace(
             accuracy,
             by_odometry=_bounded_since(by_images, by_sensors),
             by_motion=_bounded_since(by_sensors, accuracy),
         )
-        if closed.sensors:
+        if closed.sensors and not closed.sensors.verified:
             del covariances  # only one large factor is in memory
-            graph = external_sensors.with_sensors(
-                self._measured(refined.graph, refinement), external_sensors.SensorPriors(between)
-            )
-            covariances = graph_covariances.GraphCovariances(graph)
+            sensors = replace(closed.sensors, steps=(*closed.sensors.steps, *between))
+            covariances = assessed(sensors, observed)[1]
         return accuracy, pose_accuracy.covariances_of(covariances, observed)
+
+    def _by_images(self, closed: Optimised, refined: Refined) -> PoseGraph:
+        """Return the final graph without external sensors."""
+        if not closed.sensors:
+            return refined.graph
+        if not refined.refinement.kept:
+            return closed.visual.optimisation.graph
+        return self.tracked.build(closed.loops, refined.refinement, confirmed=closed.confirmed)
 
     def _observed_errors(
         self,

@@ -120,7 +120,7 @@ class BackEnd:
         graph = optimisation.graph
         visual = VisualEvidence(aided, optimisation)
         if sensors:
-            # The verdict uses the images alone: external sensors can't improve it.
+            # Loops and registrations are checked by the images alone.
             images_only = self._tracked.build(loops, confirmed=confirmed).with_poses(graph.poses)
             visual = VisualEvidence(aided, replace(optimisation, graph=images_only))
         return Optimised(loops, sequential, optimisation, sensors, visual, confirmed)

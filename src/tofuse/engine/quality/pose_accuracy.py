@@ -170,6 +170,13 @@ class ObservedErrors:
         """(2,) whether halves of the images measured errors of positions and of rotations."""
         return np.array([self.split_m, self.split_rad]) > 0
 
+    def of_other_sensors(self) -> ObservedErrors:
+        """Return those of poses whose covariance has the errors of the depth as odometry measured.
+
+        These include errors of the camera, and those that halves of its images share.
+        """
+        return ObservedErrors(self.moved_m, self.moved_rad, self.excess_m)
+
     def mean_squares(self, by_covariance: Float64) -> dict[str, Float64]:
         """Return the mean squares (2,) of the errors, m^2 and rad^2, by their cause.
 
