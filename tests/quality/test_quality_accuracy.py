@@ -22,6 +22,7 @@ from tofuse.engine.quality.pose_accuracy import (
     contradicted_runs,
     covariances_of,
     degenerate_directions,
+    scale_of_registrations,
     without_degenerate,
 )
 from tofuse.engine.quality.trajectory_errors import displacement
@@ -84,7 +85,15 @@ def bound_of(*errors: float, **named: float) -> Accuracy:
     return accuracy_of(GraphCovariances(walk()), ObservedErrors(*errors, **named), 1.0)
 
 
-def test_errors_of_the_camera_are_measured_by_odometry():
+def test_scaled_registrations_include_errors_of_the_camera():
+    graph = GraphCovariances(walk())
+    assert scale_of_registrations(graph, ObservedErrors()) == (1.0, 1.0)
+    scale, by_rotation = scale_of_registrations(graph, ObservedErrors(calibration_m=0.2))
+    assert scale == pytest.approx(np.sqrt(1 + 0.2**2 / noise_m() ** 2))
+    assert by_rotation == 1.0
+
+
+def test_scaled_covariance_leaves_other_causes():
     observed = ObservedErrors(0.03, 0.02, 0.04, 0.05, 0.06, 0.07, 0.08)
     by_odometry = observed.of_other_sensors().mean_squares(np.array([1e-4, 1e-5]))
     np.testing.assert_array_equal(by_odometry["noise"], [1e-4, 1e-5])

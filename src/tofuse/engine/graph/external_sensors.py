@@ -134,6 +134,16 @@ class SensorPriors:
             self.depth_scale if self.steps else other.depth_scale,
         )
 
+    @property
+    def is_continuous(self) -> bool:
+        """Whether no step of odometry was rejected, as where a device relocalizes."""
+        return all(r.used == r.measured for r in self.records if r.sensor == "odometry")
+
+    def with_depth_scale_of(self, at_least: tuple[float, float]) -> SensorPriors:
+        """Return the measurements with factors on the sigmas of registrations of at least these."""
+        translation, rotation = np.maximum(self.depth_scale, at_least).tolist()
+        return replace(self, depth_scale=(translation, rotation))
+
     def gravity_of(self, ids: Sequence[int]) -> Gravity | None:
         """Gravity at the vertices `ids` of a graph; None if none of them has it."""
         if self.gravity is None:

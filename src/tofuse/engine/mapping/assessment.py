@@ -198,9 +198,15 @@ class Assessment:
         sensors = external_sensors.SensorPriors()
         accuracy, covariances = assessed(sensors, observed)
         by_images = accuracy
-        if closed.sensors.verified:
-            # Compared with odometry, all errors of the depth were measured, whatever their cause.
-            sensors, observed = closed.sensors, observed.of_other_sensors()
+        together = closed.sensors.verified and closed.sensors.is_continuous
+        if together:
+            scale = pose_accuracy.scale_of_registrations(covariances, observed)
+            sensors = closed.sensors.with_depth_scale_of(scale)
+            observed = observed.of_other_sensors()
+            accuracy, covariances = assessed(sensors, observed)
+        elif closed.sensors.verified and accuracy.unbounded:
+            steps = self.tracked.steps_at_degenerate(closed.sensors)
+            sensors = external_sensors.SensorPriors(steps)
             accuracy, covariances = assessed(sensors, observed)
         by_sensors = accuracy
         between = self.tracked.steps_at_unbounded(claimed, accuracy.unbounded)
@@ -212,7 +218,7 @@ class Assessment:
             by_odometry=_bounded_since(by_images, by_sensors),
             by_motion=_bounded_since(by_sensors, accuracy),
         )
-        if closed.sensors and not closed.sensors.verified:
+        if closed.sensors and not together:
             del covariances  # only one large factor is in memory
             sensors = replace(closed.sensors, steps=(*closed.sensors.steps, *between))
             covariances = assessed(sensors, observed)[1]

@@ -171,10 +171,7 @@ class ObservedErrors:
         return np.array([self.split_m, self.split_rad]) > 0
 
     def of_other_sensors(self) -> ObservedErrors:
-        """Return those of poses whose covariance has the errors of the depth as odometry measured.
-
-        These include errors of the camera, and those that halves of its images share.
-        """
+        """Return those that remain if the covariance is scaled by `scale_of_registrations`."""
         return ObservedErrors(self.moved_m, self.moved_rad, self.excess_m)
 
     def mean_squares(self, by_covariance: Float64) -> dict[str, Float64]:
@@ -467,6 +464,30 @@ def accuracy_of(
         causes_m=causes_m if np.isfinite(position) else {},
         degrees=float(observed.scale_degrees[0]),
     )
+
+
+def scale_of_registrations(
+    covariances: graph_covariances.GraphCovariances, observed: ObservedErrors
+) -> tuple[float, float]:
+    """Factors on the sigmas of a graph's registrations, of translation and of rotation.
+
+    With them the covariance includes what halves of the images and the camera add to it, so that
+    registrations can be combined with other measurements.
+
+    Parameters
+    ----------
+    covariances
+        Of the graph of registrations alone.
+    observed
+        Errors of its poses.
+    """
+    by_covariance = _CovarianceErrors.of_graph(covariances)
+    if by_covariance is None:
+        return 1.0, 1.0
+    causes = observed.mean_squares(by_covariance.squares)
+    ratio = _ratio(causes["noise"] + causes["calibration"], by_covariance.squares)
+    translation, rotation = np.sqrt(np.maximum(ratio, 1.0)).tolist()
+    return translation, rotation
 
 
 def bound_by_covariance(C: Float64) -> float:
