@@ -11,19 +11,19 @@ from collections.abc import Sequence
 import numpy as np
 
 from tofuse.engine.quality import pose_accuracy
-from tofuse.engine.refinement.calibration_check import TOLERANCES, CalibrationCheck
+from tofuse.engine.refinement import calibration_check
 from tofuse.engine.sensor import CameraErrors
 
 _UNKNOWN = float(np.sqrt(pose_accuracy.UNKNOWN_FRACTION))
 
 
-def _credence(check: CalibrationCheck) -> float:
+def _credence(check: calibration_check.CalibrationCheck) -> float:
     """Return the fraction of an estimated error that counts."""
     return 1.0 if check.is_likely else _UNKNOWN
 
 
 def pose_errors(
-    check: CalibrationCheck, corrections: Sequence[CameraErrors]
+    check: calibration_check.CalibrationCheck, corrections: Sequence[CameraErrors]
 ) -> tuple[float, float]:
     """Return the rms of the pose errors (m, rad) due to the calibration.
 
@@ -33,19 +33,23 @@ def pose_errors(
     """
     errors = [_credence(check) * np.array(check.moved), np.array(check.changed)]
     if check.undetermined:
-        errors.append(_UNKNOWN * TOLERANCES["focal"] * np.array(check.motion["focal"]))
+        errors.append(
+            _UNKNOWN * calibration_check.TOLERANCES["focal"] * np.array(check.motion["focal"])
+        )
     if check.alarm and check.gap is not None:
         errors.append(np.array(check.gap.before))
     for part in corrections:
         for name, motion in check.motion.items():
             errors.append(part.sigmas[name] * np.array(motion))
             if part.errors[name]:  # as of usual cameras, by what all views have in common
-                errors.append(_UNKNOWN * TOLERANCES[name] * np.array(motion))
+                errors.append(_UNKNOWN * calibration_check.TOLERANCES[name] * np.array(motion))
     m, rad = np.linalg.norm(errors, axis=0).tolist()
     return m, rad
 
 
-def sigmas(check: CalibrationCheck, corrections: Sequence[CameraErrors]) -> dict[str, float]:
+def sigmas(
+    check: calibration_check.CalibrationCheck, corrections: Sequence[CameraErrors]
+) -> dict[str, float]:
     """Return the standard deviations of the focal length and of the range offset, by name.
 
     That of the focal length is that of usual cameras, as far as the views don't know better; it
@@ -58,7 +62,7 @@ def sigmas(check: CalibrationCheck, corrections: Sequence[CameraErrors]) -> dict
         shown = max((part.sigmas[name] for part in corrections), default=0.0)
         if not corrections and check.determines(name):
             shown = (_credence(check) if name in check.errors else _UNKNOWN) * abs(error)
-        known = float(1 / np.hypot(1 / TOLERANCES[name], 1 / sigma))
+        known = float(1 / np.hypot(1 / calibration_check.TOLERANCES[name], 1 / sigma))
         if name == "focal" or shown > 0:
             found[name] = float(np.hypot(shown, known))
     return found
