@@ -20,19 +20,27 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.results import Reconstruction
 from tofuse.lab.simulation.mirrors import Mirror, hang_mirror
 from tofuse.lab.world import scene as scenes
-from unusual import Unusual, known
+from unusual import UNUSUAL, Unusual, known
 
 CAMERAS = ("ifm-o3r", "kinect2", "azure-nfov", "sr4000")
-# Scene, motion, frames, and their rate.
+# Builder and motion as functions of the seed, frames, and their rate.
 SCENES = {
-    "room": (unusual._in_room(unusual.calm), 72, 6.0),
-    "empty-room": (unusual._in_room(unusual.calm), 72, 6.0),
-    "flat": (unusual._elsewhere_in_flat, 60, 10.0),
+    "room": (known("room"), unusual._in_room(unusual.calm), 72, 6.0),
+    "empty-room": (known("empty-room"), unusual._in_room(unusual.calm), 72, 6.0),
+    "flat": (known("flat"), unusual._elsewhere_in_flat, 60, 10.0),
+    "flat-alike": (known("flat-alike"), unusual._elsewhere_in_flat, 60, 10.0),
+    "corridor": (known("corridor"), lambda seed: scenes.build("corridor", seed=seed)[1].camera_path, 60, 30.0),
+    "aisle": (UNUSUAL["aisle of identical shelves"].scene, UNUSUAL["aisle of identical shelves"].path, 72, 8.0),
 }
-WITH_MIRROR = [
-    (("room", "empty-room", "room", "flat")[k % 4], CAMERAS[k // 4 % 4], k) for k in range(20)
-]
-WITHOUT = [(("flat", "flat-alike", "room")[k % 3], CAMERAS[k // 3 % 4], 100 + k) for k in range(9)]
+POSITIVE, NEGATIVE = ("room", "empty-room", "room", "flat"), ("flat-alike", "aisle", "flat", "corridor")
+
+
+def cases(first: int, count: int, names: tuple[str, ...]) -> list[tuple[str, str, int]]:
+    """Return scene, camera and seed of `count` recordings."""
+    return [
+        (names[k % len(names)], CAMERAS[k // len(names) % len(CAMERAS)], first + k)
+        for k in range(count)
+    ]
 
 
 def size_of(seed: int) -> tuple[float, float]:
@@ -45,9 +53,9 @@ def simulated(
     name: str, camera: str, seed: int, *, mirror: bool
 ) -> tuple[tofuse.Recording, Mirror | None, np.ndarray]:
     """Simulate a recording of 112 x 84 pixels; with the mirror, and T_world_room."""
-    path, frames, rate = SCENES[name.removesuffix("-alike")]
+    build, path, frames, rate = SCENES[name]
     model = unusual.pinhole(camera, 112, 84, 60)
-    one = Unusual(known(name), path, model, frames, rate)
+    one = Unusual(build, path, model, frames, rate)
     scene, hung = one.scene(seed), None
     sequence = scenes.Sequence(frames, 1, rate, one.path(seed))
     if mirror:

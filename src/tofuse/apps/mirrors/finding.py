@@ -16,9 +16,9 @@ from tofuse.engine.fusion import Cloud
 from tofuse.engine.results import Mirror, Reconstruction
 
 # A mirror is this much likelier than chance (logarithm), and agrees in this share of its pixels.
-_MIN_LOG_RATIO, _MIN_SHARE = 7.0, 0.55
+_MIN_LOG_RATIO, _MIN_SHARE = 7.0, 0.3
 # Points that predict, views of a first look, and the smallest share there for a second one.
-_POINTS, _FIRST_LOOK, _PROMISING = 30_000, 10, 0.4
+_POINTS, _FIRST_LOOK, _PROMISING = 30_000, 10, 0.2
 _ORIGINS = 300  # cameras from which points behind a mirror may be seen
 _MAX_GROWTH = 1.25  # of the area, by joining parts of one mirror
 
@@ -62,6 +62,7 @@ _Found = tuple[Opening, Evidence]
 def _weighed(
     opening: Opening, views: Sequence[View], points: Float64, normals: Float64, noise: Noise
 ) -> Evidence:
+    views = [view for view in views if opening.seen_by(view, 2 * noise.tolerance_m)]
     step = max(1, len(views) // _FIRST_LOOK)
     first = weigh(opening, views[::step], points, normals, noise, compare=False)
     if not opening.whole or (step > 1 and first.patches and first.share < _PROMISING):

@@ -20,7 +20,7 @@ _RAYS, _MIN_INCIDENCE = 6000, 0.08
 # An opening: minimum number of cells, of rays in a cell, share of an opening's convex hull that it
 # fills, and share of its border where the plane is a surface; the last two also for a whole one.
 _MIN_CELLS, _MIN_RAYS, _MIN_CONVEXITY, _MIN_FRAME = 12, 3, 0.7, 0.3
-_WHOLE_CONVEXITY, _WHOLE_FRAME = 0.88, 0.8
+_WHOLE_CONVEXITY, _WHOLE_FRAME = 0.78, 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +123,14 @@ class Opening:
             rows = rows[~out[rows]]
         return out
 
+    def seen_by(self, view: View, margin: float) -> bool:
+        """Whether a view from before the plane has a part of the opening in its image."""
+        corners = self.corners
+        inner = corners.mean(0) + np.linspace(0, 1, 5)[:, None, None] * (corners - corners.mean(0))
+        return self.plane.height(view.origin) > margin and bool(
+            view.project(inner.reshape(-1, 3))[2].any()
+        )
+
     def joined(self, other: Opening) -> Opening:
         """Return the smallest convex opening of both, in this one's plane."""
         corners = np.concatenate([self.corners, other.corners]) @ self.plane.axes.T
@@ -155,7 +163,9 @@ def find_openings(plane: Plane, views: Sequence[View], noise: Noise) -> list[Ope
         rays = rays @ view.T_world_camera[:3, :3].T
         reached = plane.crossings(view.origin, rays)
         depth = (measured - reached) * np.abs(rays @ plane.normal)
-        used = (measured > 0) & np.isfinite(reached) & (depth > -margin)
+        # Where nothing returns, the plane is no surface either.
+        depth[measured <= 0] = np.inf
+        used = np.isfinite(reached) & (depth > -margin)
         q = view.origin + reached[used, None] * rays[used]
         places.append(q @ plane.axes.T)
         passed.append(depth[used] > margin)
@@ -197,7 +207,12 @@ def _regions(
     )
     openings = []
     for label in range(1, count):
-        region = (labels == label).astype(np.uint8)
+        # Without holes: pixels of noise.
+        contours, _ = cv2.findContours(
+            (labels == label).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+        )
+        region = cv2.drawContours(np.zeros(labels.shape, np.uint8), contours, -1, 1, cv2.FILLED)
+        region = cv2.morphologyEx(region, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
         cells = int(region.sum())
         if cells < _MIN_CELLS:
             continue
@@ -205,9 +220,9 @@ def _regions(
         square = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
         places = (np.stack([rows, columns], 1)[:, None] + square).reshape(-1, 2)
         hull = _hull(places)
-        border = cv2.dilate(region, np.ones((5, 5), np.uint8)) > region
+        border = (cv2.dilate(region, np.ones((5, 5), np.uint8)) > region) & (rays >= _MIN_RAYS)
         convexity = cells / max(cv2.contourArea(hull.astype(np.float32)), 1e-9)
-        framed = float(is_surface[border].mean())
+        framed = float(is_surface[border].mean()) if border.any() else 0.0
         if convexity < _MIN_CONVEXITY or framed < _MIN_FRAME:
             continue
         whole = convexity > _WHOLE_CONVEXITY and framed > _WHOLE_FRAME
