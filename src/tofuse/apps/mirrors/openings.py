@@ -20,7 +20,8 @@ _RAYS, _MIN_INCIDENCE = 6000, 0.08
 # An opening: minimum number of cells, of rays in a cell, share of an opening's convex hull that it
 # fills, and share of its border where the plane is a surface; the last two also for a whole one.
 _MIN_CELLS, _MIN_RAYS, _MIN_CONVEXITY, _MIN_FRAME = 12, 3, 0.7, 0.3
-_WHOLE_CONVEXITY, _WHOLE_FRAME = 0.78, 0.9
+_WHOLE_CONVEXITY, _WHOLE_FRAME = 0.78, 0.8
+_RING_M = 0.2  # of the surface around an opening
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +132,14 @@ class Opening:
             view.project(inner.reshape(-1, 3))[2].any()
         )
 
+    def tilt_rad(self, points: Float64, normals: Float64, margin: float) -> float:
+        """Angle between the plane and the surface (N, 3) around the opening that is in it."""
+        near = np.abs(self.plane.height(points)) < margin
+        near[near] = self.grown(_RING_M).contains(points[near]) & ~self.contains(points[near])
+        mean = normals[near].sum(0)
+        length = np.linalg.norm(mean)
+        return float(np.arccos(mean @ self.plane.normal / length)) if length else np.inf
+
     def joined(self, other: Opening) -> Opening:
         """Return the smallest convex opening of both, in this one's plane."""
         corners = np.concatenate([self.corners, other.corners]) @ self.plane.axes.T
@@ -220,9 +229,9 @@ def _regions(
         square = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
         places = (np.stack([rows, columns], 1)[:, None] + square).reshape(-1, 2)
         hull = _hull(places)
-        border = (cv2.dilate(region, np.ones((5, 5), np.uint8)) > region) & (rays >= _MIN_RAYS)
+        border = cv2.dilate(region, np.ones((5, 5), np.uint8)) > region
         convexity = cells / max(cv2.contourArea(hull.astype(np.float32)), 1e-9)
-        framed = float(is_surface[border].mean()) if border.any() else 0.0
+        framed = float(is_surface[border].mean())
         if convexity < _MIN_CONVEXITY or framed < _MIN_FRAME:
             continue
         whole = convexity > _WHOLE_CONVEXITY and framed > _WHOLE_FRAME
