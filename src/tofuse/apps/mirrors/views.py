@@ -79,7 +79,7 @@ class View:
 
 
 def wrapped(difference: Float64, ambiguity_m: Float64 | float) -> Float64:
-    """Differences (N,) of ranges without multiples of the ambiguity range; infinite: as they are."""
+    """Differences (N,) of ranges without multiples of the ambiguity range (or infinite)."""
     periods = np.where(np.isfinite(ambiguity_m), np.round(difference / ambiguity_m), 0.0)
     return difference - periods * np.where(np.isfinite(ambiguity_m), ambiguity_m, 0.0)
 
