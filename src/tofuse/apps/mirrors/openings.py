@@ -128,9 +128,8 @@ class Opening:
         """Whether a view from before the plane has a part of the opening in its image."""
         corners = self.corners
         inner = corners.mean(0) + np.linspace(0, 1, 5)[:, None, None] * (corners - corners.mean(0))
-        return self.plane.height(view.origin) > margin and bool(
-            view.project(inner.reshape(-1, 3))[2].any()
-        )
+        in_image = view.project(inner.reshape(-1, 3))[2]
+        return bool(self.plane.height(view.origin) > margin) and bool(in_image.any())
 
     def tilt_rad(self, points: Float64, normals: Float64, margin: float) -> float:
         """Angle between the plane and the surface (N, 3) around the opening that is in it."""
