@@ -18,7 +18,8 @@ _MAX_PLANES = 16
 # Rays of a view that are tested, and the smallest cosine between a ray and the plane's normal.
 _RAYS, _MIN_INCIDENCE = 6000, 0.08
 # An opening: minimum number of cells, of rays in a cell, share of an opening's convex hull that it
-# fills, and share of its border where the plane is a surface; the last two also for a whole one.
+# fills, and share of its border where the plane is a surface; the last two also for a whole one,
+# whose outline noise may fray, but whose border is closed.
 _MIN_CELLS, _MIN_RAYS, _MIN_CONVEXITY, _MIN_FRAME = 12, 3, 0.7, 0.3
 _WHOLE_CONVEXITY, _WHOLE_FRAME = 0.78, 0.8
 _RING_M = 0.2  # of the surface around an opening
@@ -230,7 +231,7 @@ def _regions(
         hull = _hull(places)
         border = cv2.dilate(region, np.ones((5, 5), np.uint8)) > region
         convexity = cells / max(cv2.contourArea(hull.astype(np.float32)), 1e-9)
-        framed = float(is_surface[border].mean())
+        framed = float(is_surface[border].mean()) if border.any() else 0.0
         if convexity < _MIN_CONVEXITY or framed < _MIN_FRAME:
             continue
         whole = convexity > _WHOLE_CONVEXITY and framed > _WHOLE_FRAME

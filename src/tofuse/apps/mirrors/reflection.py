@@ -2,8 +2,8 @@
 
 The image in a mirror is that of the mirrored room, so its points are projected into the views. A
 camera that illuminates the scene also illuminates what it sees in the mirror, by two paths: by the
-mirror and back, and directly and back by the mirror, which is shorter. The range is between the
-two, by their strengths; where one of them is negligible, it is the other one.
+mirror and back, and directly and back by the mirror, which is shorter. How the two add up depends
+on the camera: as phasors of its modulation, in proportion to their strengths, or the stronger one.
 """
 
 from __future__ import annotations
@@ -25,12 +25,11 @@ _DIVISION = 0.1
 _PERIODS_M, _LIT = (0.0, np.inf, *np.geomspace(0.7, 6.0, 38)), 1500
 # Beyond this multiple of the corner's angle, lamps don't shine.
 _LAMP = 1.3
-# Planes that are compared: wrong by so much.
+# Planes that are compared: shifted by so much, or by so many tolerances, and tilted.
 _SHIFT_M, _SHIFT_TOLERANCES, _TILT_RAD = 0.2, 5.0, 0.2
 # Edge of a patch of the room, whose points are one piece of evidence, and how many it has.
 _PATCH_M, _MIN_IN_PATCH = 0.2, 5
-# Fewest patches that can decide, and smallest share of agreeing pixels worth a comparison.
-_MIN_PATCHES, _MIN_SHARE = 15, 0.5
+_MIN_PATCHES = 15  # fewest that can decide
 # A mirror explains one of these shares of the pixels that chance does not: weak pixels, which are
 # unwrapped wrongly, are not explained. Chance before any comparison.
 _EXPLAINED, _CHANCE = np.linspace(0.05, 0.95, 10), 0.3
