@@ -16,9 +16,11 @@ from tofuse.engine.fusion import Cloud
 from tofuse.engine.results import Mirror, Reconstruction
 
 # A mirror is this much likelier than chance (logarithm), and agrees in this share of its pixels.
-_MIN_LOG_RATIO, _MIN_SHARE = 7.0, 0.55
+_MIN_LOG_RATIO, _MIN_SHARE = 7.0, 0.3
 # Points that predict, views of a first look, and the smallest share there for a second one.
-_POINTS, _FIRST_LOOK, _PROMISING = 30_000, 10, 0.4
+_POINTS, _FIRST_LOOK, _PROMISING = 30_000, 10, 0.2
+# Planes of several surfaces are none: half of the tilt at which a mirror is a wrong one.
+_MAX_TILT_RAD = 0.1
 _ORIGINS = 300  # cameras from which points behind a mirror may be seen
 _MAX_GROWTH = 1.25  # of the area, by joining parts of one mirror
 
@@ -50,6 +52,7 @@ def find_mirrors(recording: Recording, result: Reconstruction, seed: int = 0) ->
         weighed = [
             (opening, _weighed(opening, views, points, normals, noise))
             for opening in find_openings(plane, views, noise)
+            if opening.tilt_rad(points, normals, 2 * noise.tolerance_m) < _MAX_TILT_RAD
         ]
         found += _mirrors_in(weighed)
     found.sort(key=lambda item: -item[1].log_ratio)
@@ -62,6 +65,7 @@ _Found = tuple[Opening, Evidence]
 def _weighed(
     opening: Opening, views: Sequence[View], points: Float64, normals: Float64, noise: Noise
 ) -> Evidence:
+    views = [view for view in views if opening.seen_by(view, 2 * noise.tolerance_m)]
     step = max(1, len(views) // _FIRST_LOOK)
     first = weigh(opening, views[::step], points, normals, noise, compare=False)
     if not opening.whole or (step > 1 and first.patches and first.share < _PROMISING):
@@ -100,12 +104,16 @@ def _applied(
         centre = opening.corners.mean(0)[None]
         if any(_same_place(other, centre, origins, margin) for other in taken):
             continue
+        through = _through(opening, cloud.points, origins, margin)
+        behind, room = _behind(opening, cloud.points, through, views, margin)
+        if room:
+            continue
         taken.append(opening)
-        behind = _behind(opening, cloud.points, views, origins, margin)
         seen = cloud.points[behind]
         cloud = _kept(cloud, ~behind)
         if mesh is not None:
-            inside = ~_behind(opening, mesh.vertices, views, origins, margin)
+            through = _through(opening, mesh.vertices, origins, margin)
+            inside = ~_behind(opening, mesh.vertices, through, views, margin)[0]
             mesh = mesh.rows(np.asarray(inside[mesh.faces].all(1), np.bool_))
         mirrors.append(
             Mirror(
@@ -128,26 +136,33 @@ def _same_place(known: Opening, centre: Float64, origins: Float64, margin: float
     return bool(in_it or known.behind(centre, origins)[0])
 
 
-def _behind(
-    opening: Opening,
-    points: Float32,
-    views: Sequence[View],
-    origins: Float64,
-    margin: float,
-) -> Bool:
-    """Which points (N, 3) are seen through an opening only: not from behind its plane as well."""
-    world = points.astype(np.float64)
-    rows = np.flatnonzero(opening.plane.height(world) < -margin)
+def _through(opening: Opening, points: Float32, origins: Float64, margin: float) -> Bool:
+    """Which points (N, 3) behind the plane are seen through an opening."""
+    rows = np.flatnonzero(opening.plane.height(points.astype(np.float64)) < -margin)
     out = np.zeros(len(points), bool)
-    out[rows] = opening.grown(margin).behind(world[rows], origins)
-    for view in views:
-        if opening.plane.height(view.origin) > -margin or not out.any():
-            continue
-        rows = np.flatnonzero(out)
-        in_camera, pixels, inside = view.project(world[rows])
-        distance = np.linalg.norm(in_camera, axis=1)
-        out[rows] = ~(inside & (np.abs(view.at(view.ranges, pixels) - distance) < margin))
+    out[rows] = opening.grown(margin).behind(points[rows].astype(np.float64), origins)
     return out
+
+
+def _behind(
+    opening: Opening, points: Float32, through: Bool, views: Sequence[View], margin: float
+) -> tuple[Bool, bool]:
+    """Which points (N, 3) are seen through an opening only, and whether it is a room's.
+
+    Views from behind the plane measure the points of a room there, but not what a mirror shows.
+    """
+    rows = np.flatnonzero(through)
+    looked, measured = np.zeros((2, len(rows)), bool)
+    for view in views:
+        if opening.plane.height(view.origin) > -margin or not len(rows):
+            continue
+        in_camera, pixels, inside = view.project(points[rows].astype(np.float64))
+        beyond = view.at(view.ranges, pixels) - np.linalg.norm(in_camera, axis=1)
+        looked |= inside & (beyond > -margin)
+        measured |= inside & (np.abs(beyond) < margin)
+    out = through.copy()
+    out[rows] = ~measured
+    return out, bool(measured.sum() > 0.5 * looked.sum())
 
 
 def _kept(cloud: Cloud, rows: Bool) -> Cloud:

@@ -18,9 +18,11 @@ _MAX_PLANES = 16
 # Rays of a view that are tested, and the smallest cosine between a ray and the plane's normal.
 _RAYS, _MIN_INCIDENCE = 6000, 0.08
 # An opening: minimum number of cells, of rays in a cell, share of an opening's convex hull that it
-# fills, and share of its border where the plane is a surface; the last two also for a whole one.
+# fills, and share of its border where the plane is a surface; the last two also for a whole one,
+# whose outline noise may fray, but whose border is closed.
 _MIN_CELLS, _MIN_RAYS, _MIN_CONVEXITY, _MIN_FRAME = 12, 3, 0.7, 0.3
-_WHOLE_CONVEXITY, _WHOLE_FRAME = 0.88, 0.8
+_WHOLE_CONVEXITY, _WHOLE_FRAME = 0.78, 0.8
+_RING_M = 0.2  # of the surface around an opening
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +125,21 @@ class Opening:
             rows = rows[~out[rows]]
         return out
 
+    def seen_by(self, view: View, margin: float) -> bool:
+        """Whether a view from before the plane has a part of the opening in its image."""
+        corners = self.corners
+        inner = corners.mean(0) + np.linspace(0, 1, 5)[:, None, None] * (corners - corners.mean(0))
+        in_image = view.project(inner.reshape(-1, 3))[2]
+        return bool(self.plane.height(view.origin) > margin) and bool(in_image.any())
+
+    def tilt_rad(self, points: Float64, normals: Float64, margin: float) -> float:
+        """Angle between the plane and the surface (N, 3) around the opening that is in it."""
+        near = np.abs(self.plane.height(points)) < margin
+        near[near] = self.grown(_RING_M).contains(points[near]) & ~self.contains(points[near])
+        mean = normals[near].sum(0)
+        length = np.linalg.norm(mean)
+        return float(np.arccos(mean @ self.plane.normal / length)) if length else np.inf
+
     def joined(self, other: Opening) -> Opening:
         """Return the smallest convex opening of both, in this one's plane."""
         corners = np.concatenate([self.corners, other.corners]) @ self.plane.axes.T
@@ -155,7 +172,9 @@ def find_openings(plane: Plane, views: Sequence[View], noise: Noise) -> list[Ope
         rays = rays @ view.T_world_camera[:3, :3].T
         reached = plane.crossings(view.origin, rays)
         depth = (measured - reached) * np.abs(rays @ plane.normal)
-        used = (measured > 0) & np.isfinite(reached) & (depth > -margin)
+        # Where nothing returns, the plane is no surface either.
+        depth[measured <= 0] = np.inf
+        used = np.isfinite(reached) & (depth > -margin)
         q = view.origin + reached[used, None] * rays[used]
         places.append(q @ plane.axes.T)
         passed.append(depth[used] > margin)
@@ -197,7 +216,12 @@ def _regions(
     )
     openings = []
     for label in range(1, count):
-        region = (labels == label).astype(np.uint8)
+        # Without holes: pixels of noise.
+        contours, _ = cv2.findContours(
+            (labels == label).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+        )
+        region = cv2.drawContours(np.zeros(labels.shape, np.uint8), contours, -1, 1, cv2.FILLED)
+        region = cv2.morphologyEx(region, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
         cells = int(region.sum())
         if cells < _MIN_CELLS:
             continue
@@ -207,7 +231,7 @@ def _regions(
         hull = _hull(places)
         border = cv2.dilate(region, np.ones((5, 5), np.uint8)) > region
         convexity = cells / max(cv2.contourArea(hull.astype(np.float32)), 1e-9)
-        framed = float(is_surface[border].mean())
+        framed = float(is_surface[border].mean()) if border.any() else 0.0
         if convexity < _MIN_CONVEXITY or framed < _MIN_FRAME:
             continue
         whole = convexity > _WHOLE_CONVEXITY and framed > _WHOLE_FRAME

@@ -2,8 +2,8 @@
 
 The image in a mirror is that of the mirrored room, so its points are projected into the views. A
 camera that illuminates the scene also illuminates what it sees in the mirror, by two paths: by the
-mirror and back, and directly and back by the mirror, which is shorter. The range is between the
-two, by their strengths; where one of them is negligible, it is the other one.
+mirror and back, and directly and back by the mirror, which is shorter. How the two add up depends
+on the camera: as phasors of its modulation, in proportion to their strengths, or the stronger one.
 """
 
 from __future__ import annotations
@@ -14,18 +14,22 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from tofuse.apps.mirrors.openings import Opening, Plane
-from tofuse.apps.mirrors.views import Noise, View
+from tofuse.apps.mirrors.views import Noise, View, wrapped
 from tofuse.engine.arrays import Bool, Float64, Int64
+from tofuse.engine.frames import evenly_spaced
 
 _REFLECTANCE = 0.9  # of a mirror; the result hardly depends on it
+# Share of light that the shorter path may have more or less than predicted.
+_DIVISION = 0.1
+# Wavelengths of the modulation that are tried, on so many pixels.
+_PERIODS_M, _LIT = (0.0, np.inf, *np.geomspace(0.7, 6.0, 38)), 1500
 # Beyond this multiple of the corner's angle, lamps don't shine.
 _LAMP = 1.3
-# Planes that are compared: wrong by so much.
-_SHIFTS_M, _TILT_RAD = (-0.4, -0.2, 0.2, 0.4), 0.2
+# Planes that are compared: shifted by so much, or by so many tolerances, and tilted.
+_SHIFT_M, _SHIFT_TOLERANCES, _TILT_RAD = 0.2, 5.0, 0.2
 # Edge of a patch of the room, whose points are one piece of evidence, and how many it has.
 _PATCH_M, _MIN_IN_PATCH = 0.2, 5
-# Fewest patches that can decide, and smallest share of agreeing pixels worth a comparison.
-_MIN_PATCHES, _MIN_SHARE = 15, 0.5
+_MIN_PATCHES = 15  # fewest that can decide
 # A mirror explains one of these shares of the pixels that chance does not: weak pixels, which are
 # unwrapped wrongly, are not explained. Chance before any comparison.
 _EXPLAINED, _CHANCE = np.linspace(0.05, 0.95, 10), 0.3
@@ -45,10 +49,12 @@ class Prediction:
         (N,) distance from the camera to the point, and the share of the light on that path.
     direct_share
         (N,) 0 where the camera does not illuminate it directly.
-    measured
-        (N,) m.
+    measured, ambiguity_m
+        (N,) m; up to multiples of the latter.
     pixels
         (N,) numbers of the pixels, through all views.
+    weak
+        (N,) whether the amplitude is low: often unwrapped wrongly.
     """
 
     points: Float64
@@ -56,23 +62,53 @@ class Prediction:
     direct: Float64
     direct_share: Float64
     measured: Float64
+    ambiguity_m: Float64
     pixels: Int64
+    weak: Bool
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def residuals(self, plane: Plane) -> Float64:
-        """Measured minus predicted ranges (N,), m, with the mirror in this plane."""
-        by_mirror = np.linalg.norm(plane.reflected(self.points) - self.origins, axis=1)
-        return self.measured - by_mirror + 0.5 * self.direct_share * (by_mirror - self.direct)
-
     def coincides(self, plane: Plane, noise: Noise) -> Bool:
-        """Which of the measured ranges agree."""
+        """Which of the measured ranges agree, with the mirror in this plane.
+
+        How the two paths add up depends on the camera: the law under which most ranges agree.
+        """
         by_mirror = np.linalg.norm(plane.reflected(self.points) - self.origins, axis=1)
-        # Two phases add up to one in between, in a ratio that depends on the frequency.
-        mixed = np.minimum(self.direct_share, 1 - self.direct_share) * (by_mirror - self.direct) / 2
-        tolerance = noise.tolerance_m * np.maximum(1, by_mirror / noise.range_m)
-        return np.abs(self.residuals(plane)) < 2 * tolerance + mixed
+        shorter = 0.5 * (by_mirror - self.direct)
+        off = self.measured - by_mirror
+        tolerance = 2 * noise.tolerance_m * np.maximum(1, by_mirror / noise.range_m)
+
+        def agree(rows: Int64, period_m: float) -> Bool:
+            share, d = self.direct_share[rows], shorter[rows]
+            less, most = (
+                _shortened(np.clip(share + change, 0, 1), d, period_m)
+                for change in (-_DIVISION, _DIVISION)
+            )
+            near = wrapped(off[rows] + (less + most) / 2, self.ambiguity_m[rows])
+            return np.abs(near) < tolerance[rows] + np.abs(most - less) / 2
+
+        lit = np.flatnonzero((self.direct_share > 0) & (self.direct_share < 1))
+        out = np.abs(wrapped(off + self.direct_share * shorter, self.ambiguity_m)) < tolerance
+        if len(lit):
+            some = evenly_spaced(lit, _LIT)
+            out[lit] = agree(lit, max(_PERIODS_M, key=lambda p: int(agree(some, p).sum())))
+        return out
+
+
+def _shortened(share: Float64, shorter: Float64, period_m: float) -> Float64:
+    """How much two paths reduce a range (N,), if one of them has a share of the light (N,).
+
+    Phases of a period add up as phasors, unwrapped by a much longer period. An infinite period:
+    in proportion to the shares; 0: of pulses, the stronger one counts.
+    """
+    if period_m == 0:
+        return np.where(share > 0.5, shorter, 0.0)
+    if np.isinf(period_m):
+        return share * shorter
+    phasor = 1 - share + share * np.exp(2j * np.pi / period_m * shorter)
+    fine = period_m / (2 * np.pi) * np.angle(phasor)
+    return np.asarray(fine + period_m * np.round((share * shorter - fine) / period_m))
 
 
 def predict(
@@ -98,11 +134,20 @@ def predict(
     phantom = mirror.reflected(points)
     points_of_none, none = np.zeros((0, 3)), np.zeros(0)
     parts = [
-        Prediction(points_of_none, points_of_none, none, none, none, np.zeros(0, np.int64)),
+        Prediction(
+            points_of_none,
+            points_of_none,
+            none,
+            none,
+            none,
+            none,
+            np.zeros(0, np.int64),
+            np.zeros(0, bool),
+        ),
     ]
     first = 0
     for view in views:
-        if plane.height(view.origin) > 2 * noise.tolerance_m:
+        if opening.seen_by(view, 2 * noise.tolerance_m):
             part = _of_view(opening, mirror, view, points, normals, phantom, noise)
             parts.append(replace(part, pixels=part.pixels + first))
         first += view.ranges.size
@@ -127,10 +172,12 @@ def _of_view(
     reached = plane.crossings(origin, rays)
     measured = view.at(view.ranges, pixels)
     used = (measured > 0) & np.isfinite(reached)
+    weak = np.zeros(len(used), bool)
     if view.amplitude is not None:
-        used &= view.at(view.amplitude, pixels) >= noise.weakest
+        weak = view.at(view.amplitude, pixels) < noise.weakest
     used[used] = opening.contains(origin + reached[used, None] * rays[used])
     rows, rays, length, measured = rows[used], rays[used], length[used], measured[used]
+    weak = weak[used]
     number = np.ravel_multi_index(tuple(pixels[used].T), view.ranges.shape)
     p, n = points[rows], normals[rows]
     in_camera, at, inside = view.project(p)
@@ -151,7 +198,9 @@ def _of_view(
         distance[known],
         share[known],
         measured[known],
+        np.full(int(known.sum()), view.ambiguity_m),
         number[known],
+        weak[known],
     )
 
 
@@ -193,11 +242,12 @@ def weigh(
     seen = predict(opening, opening.plane, views, points, normals, noise)
     agrees = seen.coincides(opening.plane, noise)
     found = patches(seen)
-    share = float(agrees.mean()) if len(seen) else 0.0
-    if not compare or found < _MIN_PATCHES or share < _MIN_SHARE:
+    strong = agrees[~seen.weak]
+    share = float(strong.mean()) if len(strong) else 0.0
+    if not compare or found < _MIN_PATCHES:
         return Evidence(share, 0.0, found)
     by_chance, compared = np.full(len(seen), _CHANCE), np.ones(len(seen))
-    for plane in wrong_planes(opening):
+    for plane in wrong_planes(opening, noise):
         other = predict(opening, plane, views, points, normals, noise)
         numbers, first = np.unique(other.pixels, return_index=True)
         if not len(numbers):
@@ -208,14 +258,17 @@ def weigh(
         compared += both
     chance = by_chance / compared
     explained = _EXPLAINED[:, None]
-    ratios = np.where(agrees, (chance + explained * (1 - chance)) / chance, 1 - explained)
-    return Evidence(share, found * float(np.log(ratios).mean(1).max()), found)
+    ratios = np.log(np.where(agrees, (chance + explained * (1 - chance)) / chance, 1 - explained))
+    # Of weak pixels, the mirror may explain less.
+    total = sum(ratios[:, k].sum(1).max() for k in (seen.weak, ~seen.weak))
+    return Evidence(share, found * float(total) / len(seen), found)
 
 
-def wrong_planes(opening: Opening) -> list[Plane]:
+def wrong_planes(opening: Opening, noise: Noise) -> list[Plane]:
     """Return planes that would be mirrors by chance only: shifted and tilted ones."""
     plane, centre = opening.plane, opening.corners.mean(0)
-    shifted = [Plane(plane.normal, plane.offset + s) for s in _SHIFTS_M]
+    shift = max(_SHIFT_M, _SHIFT_TOLERANCES * noise.tolerance_m)
+    shifted = [Plane(plane.normal, plane.offset + k * shift) for k in (-2, -1, 1, 2)]
     tilted = []
     for axis in (*plane.axes, *-plane.axes):
         normal = plane.normal + np.tan(_TILT_RAD) * axis

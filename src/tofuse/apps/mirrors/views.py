@@ -35,6 +35,8 @@ class View:
         (H, W) radial ranges, m, 0 where invalid, and amplitudes, if there are any.
     corner_rad
         Angle between the axis and the corner of the image.
+    ambiguity_m
+        Ranges are known up to multiples of it.
     """
 
     camera: Camera
@@ -42,6 +44,7 @@ class View:
     ranges: Float64
     amplitude: Float32 | None
     corner_rad: float
+    ambiguity_m: float
 
     @property
     def origin(self) -> Float64:
@@ -75,6 +78,12 @@ class View:
         return np.asarray(image[pixels[:, 0], pixels[:, 1]], np.float64)
 
 
+def wrapped(difference: Float64, ambiguity_m: Float64 | float) -> Float64:
+    """Differences (N,) of ranges without multiples of the ambiguity range (or infinite)."""
+    periods = np.where(np.isfinite(ambiguity_m), np.round(difference / ambiguity_m), 0.0)
+    return difference - periods * np.where(np.isfinite(ambiguity_m), ambiguity_m, 0.0)
+
+
 def read_views(recording: Recording, result: Reconstruction) -> list[View]:
     """Read evenly spaced frames that have a pose."""
     correctors = CameraErrors.made_with(result.config)
@@ -96,6 +105,7 @@ def read_views(recording: Recording, result: Reconstruction) -> list[View]:
                 np.where(frame.valid, frame.radial_range, 0).astype(np.float64),
                 frame.amplitude_image,
                 float(np.arctan(np.nanmax(np.linalg.norm(rays, axis=-1)))),
+                frame.ambiguity_m or np.inf,
             )
         )
     return views
@@ -128,7 +138,7 @@ class Noise:
             measured = view.at(view.ranges, pixels)
             distance = np.linalg.norm(points[rows] - view.origin, axis=1)
             valid = measured > 0
-            residuals.append(np.abs(measured - distance)[valid])
+            residuals.append(np.abs(wrapped(measured - distance, view.ambiguity_m))[valid])
             ranges.append(distance[valid])
             if view.amplitude is not None:
                 amplitudes.append(view.at(view.amplitude, pixels)[valid])
