@@ -19,8 +19,8 @@ from functools import partial
 import numpy as np
 
 import unusual
+from tofuse.apps.certainty.known import Known
 from tofuse.apps.coach.advice import best, candidates
-from tofuse.apps.coach.known import Known
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry import se3

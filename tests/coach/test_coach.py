@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import tofuse
+from tofuse.apps.certainty.known import Known
+from tofuse.apps.certainty.surfaces import Surfaces, pair_information, scales
 from tofuse.apps.coach import advice as module
-from tofuse.apps.coach.known import Known
-from tofuse.apps.coach.surfaces import Surfaces, pair_information, scales
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import Measured, build_graph, graph_covariances
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofuse.apps.coach.known import Known
+from tofuse.apps.certainty import Known
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
-from tofuse.apps.coach.known import Known
+from tofuse.apps.certainty.known import Known
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame

@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from tofuse.apps.coach.surfaces import Seen, Surfaces, pair_information, scales
+from tofuse.apps.certainty.surfaces import Seen, Surfaces, pair_information, scales
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.frames import Frame, RangeFrame, evenly_spaced
 from tofuse.engine.geometry import se3
