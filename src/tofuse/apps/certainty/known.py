@@ -29,6 +29,8 @@ _ALIGNMENT = pair_equations.RefineOptions(rounds=(pair_equations.Round(2, 0.0, 0
 _OVERLAP, _NEIGHBOURS = _ALIGNMENT.overlap, _ALIGNMENT.neighbours
 # What an alignment takes for constrained, and for a tilt that both views share.
 _TRACKING = projective.ProjectiveOptions()
+# Errors of a motion above which it counts as not bounded.
+_LIMITS = np.array([_TRACKING.prior_m, _TRACKING.prior_rad])
 # Variance of motions that no measurement bounds: m^2 and rad^2. Far above any bound, and not so far
 # that the rest is lost to rounding.
 _OPEN = 1.0
@@ -238,8 +240,7 @@ class Known:
     @property
     def gaps(self) -> Intp:
         """Positions of keyframes, the motion from which to the next one is not bounded."""
-        limits = np.array([_TRACKING.prior_m, _TRACKING.prior_rad])
-        return np.flatnonzero((self._step_squares(self.opened) > limits**2).any(1))
+        return np.flatnonzero((self._step_squares(self.opened) > _LIMITS**2).any(1))
 
     def _with_pairs(self) -> Self:
         """Return it with all pairs of keyframes that overlap, as the refinement will compare."""
@@ -315,15 +316,41 @@ class Known:
         return pose_accuracy.bound_by_covariance(P @ covariance @ P.T)
 
     def expected(
+        self, poses: Float64, ways: Sequence[Sequence[int]], views: Sequence[float]
+    ) -> Float64:
+        """(W,) bounds expected after scanning along each of some ways; see `variances`."""
+        P, C = self._to_positions, self.covariance
+        squares = self.variances(poses, ways, views, P, C).sum(1) / len(self.poses)
+        if not np.isfinite(self.bound_m):
+            return self.quantile * np.sqrt(squares)
+        before = self.mean_square
+        ratio = squares / before if before > 0 else np.ones(len(squares))
+        return self.bound_m * np.sqrt((ratio + self.other_squares) / (1 + self.other_squares))
+
+    def open_after(
+        self, poses: Float64, ways: Sequence[Sequence[int]], views: Sequence[float]
+    ) -> Float64:
+        """(W, G) errors of the motion over each gap after each of some ways; see `variances`.
+
+        In units of the limits above which it counts as not bounded.
+        """
+        gaps, k = self.gaps, len(self.poses)
+        J = np.concatenate([self._jacobians[gaps + 1], np.eye(6)[None, 3:].repeat(len(gaps), 0)], 1)
+        P = np.zeros((len(gaps), 6, k, 6))
+        P[np.arange(len(gaps)), :, gaps + 1], P[np.arange(len(gaps)), :, gaps] = J, -J
+        left = self.variances(poses, ways, views, P.reshape(-1, 6 * k), self.opened)
+        of_parts = left.reshape(len(ways), len(gaps), 2, 3).sum(3)
+        return np.sqrt(of_parts / _LIMITS**2).max(2)
+
+    def variances(
         self,
         poses: Float64,
         ways: Sequence[Sequence[int]],
         views: Sequence[float],
-        gap: int | None = None,
+        P: Float64,
+        C: Float64,
     ) -> Float64:
-        """(W,) bounds expected after scanning along each of some ways.
-
-        With a gap, those if no measurement bounded its motion yet, and that of all others.
+        """(W, R) variances of functions P (R, 6K) of the motions after each of some ways.
 
         Parameters
         ----------
@@ -333,11 +360,10 @@ class Known:
             Positions in `poses` of each way, in its order.
         views
             Numbers of views from the target, the last pose of a way, and from each one before.
+        C
+            (6K, 6K) covariance before.
         """
-        seen, P, C = self.surfaces.seen_from(poses), self._to_positions, self.covariance
-        if gap is not None:
-            after = np.arange(len(self.poses)) > gap
-            C = C + np.kron(after[:, None] == after, _OPEN * np.eye(6))
+        seen = self.surfaces.seen_from(poses)
         together = np.zeros((len(poses), len(poses)), np.bool_)
         for way in ways:
             together[np.ix_(way, way)] = True
@@ -349,8 +375,7 @@ class Known:
         ends = self.seen.of(pairs[:, 0]), seen.of(pairs[:, 1])
         H_pairs = self._information(*ends, poses[pairs[:, 1]])
         PC = P @ C
-        before = float((PC * P).sum())
-        squares = np.full(len(ways), before)
+        variances = np.tile((PC * P).sum(1), (len(ways), 1))
         for k, way in enumerate(ways):
             to_known, among = np.isin(pairs[:, 1], way), np.isin(links, way).all(1)
             rows = np.unique(pairs[to_known, 0])
@@ -374,12 +399,8 @@ class Known:
             L = full[:q, :q] - full[:q, q:] @ solved
             which = (6 * rows[:, None] + np.arange(6)).ravel()
             inner = L @ np.linalg.inv(np.eye(q) + C[np.ix_(which, which)] @ L)
-            squares[k] = before - float(((PC[:, which] @ inner) * PC[:, which]).sum())
-        squares = np.maximum(squares, 0.0)
-        if not np.isfinite(self.bound_m):
-            return self.quantile * np.sqrt(squares / len(self.poses))
-        ratio = squares / before if before > 0 else np.ones(len(squares))
-        return self.bound_m * np.sqrt((ratio + self.other_squares) / (1 + self.other_squares))
+            variances[k] -= ((PC[:, which] @ inner) * PC[:, which]).sum(1)
+        return np.maximum(variances, 0.0)
 
     def _overlapping(self, a: Seen, poses: Float64, b: Seen, others: Float64) -> Bool:
         """(M, N) whether views at poses are compared with those at others."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,8 +27,6 @@ _TURNS = (
 _REVISITS, _WEAK, _STEP_ANGLE, _STEP, _MAX_LOOKS = 8, 5, 0.6, 0.2, 5
 # On a slow way looks are so many times as dense: each holds on to what the one before sees.
 _SLOW = 3
-# A larger bound is none: a motion is left that nothing bounds, m.
-_UNBOUNDED = 0.3
 # A surface so near to the straight way, relative to its length, is in the way.
 _BLOCKED = 0.08
 # Numbers of views from there, one to two seconds of a moving camera, and from each look before.
@@ -107,7 +106,7 @@ def advise_on(so_far: OnlineMap) -> Advice | None:
 def best(known: Known, within_s: float = np.inf) -> Advice:
     """Return the best advice by what is known, with places of the last seconds only."""
     if len(known.gaps):
-        return _over_gap(known, int(known.gaps[-1]), within_s)
+        return _over_gaps(known, within_s)
     poses, moves = candidates(known, within_s)
     bounds = known.expected(poses, [move.way for move in moves], _VIEWS)
     bound_m = known.bound_m if np.isfinite(known.bound_m) else known.uncertainty_m
@@ -123,21 +122,25 @@ def best(known: Known, within_s: float = np.inf) -> Advice:
     return Advice(known.bound_m, expected_m, f"{move.words}: {gain}", pose, move.frame)
 
 
-def _over_gap(known: Known, gap: int, within_s: float) -> Advice:
-    """Advise how to bound the motion after the keyframe at `gap`."""
-    poses, moves = bridges(known, gap, within_s)
-    bounds = known.expected(poses, [move.way for move in moves], _VIEWS, gap)
-    # As long as there is a bound at all, an easy way counts more: tracking must not be lost on it.
-    move, expected_m = _easiest(moves, bounds, _EASY * bounds.min())
-    words = f"nothing bounds the motion {known.ages_s[gap]:.0f} s ago: {move.words}"
-    if len(known.gaps) > 1 or expected_m > _UNBOUNDED:
-        expected_m = np.inf
-    else:
+def _over_gaps(known: Known, within_s: float) -> Advice:
+    """Advise how to bound as many motions as one way can that no measurement bounds."""
+    poses, moves = bridges(known, within_s)
+    left = known.open_after(poses, [move.way for move in moves], _VIEWS)
+    # An easy way counts more than a low bound: tracking must not be lost on it.
+    most = np.sum(left < 1, axis=1)
+    worst = np.where(most == most.max(), np.where(left < 1, left, 0).max(1), np.inf)
+    if not most.any():
+        worst = left.min(1)
+    move, _ = _easiest(moves, worst, max(_EASY * worst.min(), 1e-9))
+    at = known.gaps[np.argmin(left[moves.index(move)])]
+    words = f"nothing bounds the motion {known.ages_s[at]:.0f} s ago: {move.words}"
+    expected_m = np.inf
+    if most.max() == len(known.gaps):
+        expected_m = float(known.expected(poses, [move.way], _VIEWS)[0])
         words += f", then {_millimetres(expected_m)} mm"
     gaps = tuple((int(known.frames[k]), int(known.frames[k + 1])) for k in known.gaps)
-    return Advice(
-        np.inf, expected_m, words, _in_world(known, poses[move.way[-1]]), move.frame, gaps
-    )
+    pose = _in_world(known, poses[move.way[-1]])
+    return Advice(np.inf, expected_m, words, pose, move.frame, gaps)
 
 
 def _easiest(
@@ -195,7 +198,7 @@ def candidates(known: Known, within_s: float = np.inf) -> tuple[Float64, list[Ca
     return np.stack(poses), moves
 
 
-def bridges(known: Known, gap: int, within_s: float = np.inf) -> tuple[Float64, list[Candidate]]:
+def bridges(known: Known, within_s: float = np.inf) -> tuple[Float64, list[Candidate]]:
     """Return poses (M, 4, 4) and ways that look at both sides of a gap from one place.
 
     From earlier places, from one side's view to the other's: from farther away, what bounds the
@@ -203,18 +206,19 @@ def bridges(known: Known, gap: int, within_s: float = np.inf) -> tuple[Float64, 
     """
     poses: list[Float64] = []
     moves = []
-    weights = known.seen.pixels[[gap, gap + 1]].astype(float)
-    sides = weights @ known.surfaces.points / weights.sum(1, keepdims=True).clip(1e-9)
-    ages = [f"{age:.0f} s ago" for age in known.ages_s[[gap, gap + 1]]]
-    for k in evenly_spaced(np.flatnonzero(known.ages_s <= within_s), _REVISITS).tolist():
-        for a, b in ((0, 1), (1, 0)):
-            start, end = (_looking_at(known.poses[k], sides[side]) for side in (a, b))
+    weights = known.seen.pixels.astype(float)
+    seen = weights @ known.surfaces.points / weights.sum(1, keepdims=True).clip(1e-9)
+    places = evenly_spaced(np.flatnonzero(known.ages_s <= within_s), _REVISITS).tolist()
+    for gap, k in itertools.product(known.gaps[-_WEAK:].tolist(), places):
+        for a, b in ((gap, gap + 1), (gap + 1, gap)):
+            start, end = (_looking_at(known.poses[k], seen[side]) for side in (a, b))
             angle = float(se3.angle(se3.inverse(start) @ end))
             count = 1 + int(_SLOW * angle / _STEP_ANGLE)
             looks, words, effort = _way_to(known, k, start, _SLOW)
             way = tuple(range(len(poses), len(poses) + len(looks) + count))
             poses += [*looks, *se3.interpolate(start, end, np.arange(1, count + 1) / count)]
-            words += f", and turn slowly from what you saw {ages[a]} to what you saw {ages[b]}"
+            first, last = known.ages_s[[a, b]]
+            words += f", and turn slowly from what you saw {first:.0f} s ago to {last:.0f} s ago"
             moves.append(Candidate(way, words, effort + angle, int(known.frames[k])))
     return np.stack(poses), moves
 

@@ -27,8 +27,8 @@ from tofuse.formats.poses import write_g2o, write_tum
 CHANGE_COLORS = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}
 
 # Of a simplified surface whose texture is made of the colours of its vertices.
-DISPLAY_FACES, _TEXTURE_SIZE = 60_000, 2048
-QUALITY = 90  # of a texture as JPEG
+DISPLAY_FACES, TEXTURE_SIZE = 60_000, 2048
+QUALITY = 88  # of a texture as JPEG
 Report = Callable[[Reconstruction, Path], None]
 MAX_PLY_POINTS = 4_000_000  # a larger cloud is compressed
 
@@ -166,7 +166,7 @@ def display_record(mesh: Mesh, faces: int = DISPLAY_FACES) -> GeometryRecord:
     """Return a simplified surface with the colours of its vertices in a texture."""
     if mesh.color is None:
         mesh = replace(mesh, color=np.zeros_like(mesh.vertices, np.uint8))
-    return textured_record(texture.baked(mesh, faces, _TEXTURE_SIZE))
+    return textured_record(texture.baked(mesh, faces, TEXTURE_SIZE))
 
 
 def textured_record(texture: Textured, jpeg: bytes | None = None) -> GeometryRecord:

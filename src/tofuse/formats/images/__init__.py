@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         read_image,
         read_raw,
         read_tiff,
+        viridis,
         write_png,
     )
     from tofuse.formats.images.video import Video
