@@ -284,11 +284,6 @@ class Known:
         return float(((P @ self.covariance) * P).sum()) / len(self.poses)
 
     @property
-    def uncertainty_m(self) -> float:
-        """95 % bound by the covariance alone."""
-        return self.quantile * self.mean_square**0.5
-
-    @property
     def position_variances(self) -> Float64:
         """(K,) mean squares of the errors of each position, relative to the graph's first pose."""
         k, J = len(self.poses), self._jacobians

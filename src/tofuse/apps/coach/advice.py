@@ -109,13 +109,14 @@ def best(known: Known, within_s: float = np.inf) -> Advice:
         return _over_gaps(known, within_s)
     poses, moves = candidates(known, within_s)
     bounds = known.expected(poses, [move.way for move in moves], _VIEWS)
-    bound_m = known.bound_m if np.isfinite(known.bound_m) else known.uncertainty_m
+    is_bound = np.isfinite(known.bound_m)
+    bound_m = known.bound_m if is_bound else known.quantile * known.mean_square**0.5
     move, expected_m = _easiest(moves, bounds, bound_m - _NEARLY_BEST * (bound_m - bounds.min()))
     before, after = _millimetres(bound_m), _millimetres(expected_m)
     gain = f"{before} to {after} mm"
-    if not np.isfinite(known.bound_m):
-        expected_m = np.inf
+    if not is_bound:
         gain = f"{100 * (1 - expected_m / bound_m):.0f} % less uncertain"
+        expected_m = np.inf
     elif before == after:
         return Advice(bound_m, bound_m, f"go on: no look back would lower the {before} mm")
     pose = _in_world(known, poses[move.way[-1]])
