@@ -80,10 +80,10 @@ def test_planned_frames_are_as_dense_as_the_motion_needs() -> None:
 
 
 def test_decisions() -> None:
-    assert planning._decision(0.0031, 0.005) == "enough"
+    assert planning._decision(0.0029, 0.005) == "enough"
     assert planning._decision(0.0045, 0.005) == "undecided"
     assert planning._decision(0.0075, 0.005) == "undecided"
-    assert planning._decision(0.0085, 0.005) == "not enough"
+    assert planning._decision(0.0087, 0.005) == "not enough"
     assert planning._decision(np.inf, 0.005) == "not enough"
 
 
