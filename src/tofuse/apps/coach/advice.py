@@ -245,9 +245,7 @@ def _way_to(known: Known, k: int, target: Float64, slow: int = 1) -> tuple[Float
     else:
         words = f"go to where you were {seconds}, {_way(motion[:3, 3])}"
     effort = step / reach + angle
-    # Tracking held on the way back, unless a gap is on it.
-    is_back = slow > 1 and k + 1 < len(known.poses) and not (known.gaps >= k).any()
-    if not is_back and not _is_blocked(known, now[:3, 3], target[:3, 3]):
+    if not _is_blocked(known, now[:3, 3], target[:3, 3]):
         return se3.interpolate(now, target, np.arange(1, looks + 1) / looks), words, effort
     words = f"go back the way you came, to where you were {seconds}"
     back = np.arange(k, len(known.poses) - 1)[::-1]
