@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from tofuse.apps.export.scene import Scene
+from tofuse.apps.results import viridis
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.fusion import display_colors
 from tofuse.engine.geometry import quaternion
 from tofuse.formats.files import atomic, reading
-from tofuse.formats.images import jpeg_bytes, viridis
+from tofuse.formats.images import jpeg_bytes
 
 # Times in s since 1970 are shown as dates; this is in 2001.
 _FIRST_DATE = 1e9

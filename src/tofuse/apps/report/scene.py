@@ -11,11 +11,11 @@ import numpy as np
 
 from tofuse.apps.report import thumbnails
 from tofuse.apps.report.packing import normal_bytes, pack, quantized
-from tofuse.apps.results import QUALITY
+from tofuse.apps.results import QUALITY, viridis
 from tofuse.engine.arrays import Float32, Float64, Int32, Intp, UInt8, UInt16
 from tofuse.engine.fusion import Cloud, Mesh, Textured, display_colors
 from tofuse.engine.results import Reconstruction
-from tofuse.formats.images import jpeg_bytes, viridis
+from tofuse.formats.images import jpeg_bytes
 
 MAX_POINTS = 150_000
 _MAX_SEGMENTS = 1000  # segments of a trajectory

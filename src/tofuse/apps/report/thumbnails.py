@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.apps.results import viridis
 from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
 from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.formats.images import viridis
 
 # A grey that differs from both ends of the colour map.
 NO_MEASUREMENT = (128, 128, 132)

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         QUALITY,
         TEXTURE_SIZE,
         textured_record,
+        viridis,
         write_result,
     )
 

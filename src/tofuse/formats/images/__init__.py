@@ -23,7 +23,6 @@ if TYPE_CHECKING:
         read_image,
         read_raw,
         read_tiff,
-        viridis,
         write_png,
     )
     from tofuse.formats.images.video import Video

@@ -10,14 +10,13 @@ import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float64, UInt8
+from tofuse.engine.arrays import UInt8
 from tofuse.engine.errors import InputError
 from tofuse.formats.files import atomic, npz, reading
 
@@ -436,17 +435,3 @@ def jpeg_bytes(image: UInt8, quality: int = 92) -> bytes:
 def write_png(path: str | Path, image: NDArray[np.generic]) -> None:
     """Write (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB; see `replacing` for errors."""
     atomic.write_bytes(path, png_bytes(image))
-
-
-def viridis(value: Float64) -> UInt8:
-    """Return viridis colours (..., 3) of values from 0 to 1: near is dark, far is bright."""
-    return _ramp()[np.round(255 * np.clip(np.nan_to_num(value), 0, 1)).astype(np.intp)]
-
-
-@cache
-def _ramp() -> UInt8:
-    """The 256 colours of the map, (256, 3) RGB."""
-    import cv2
-
-    levels = np.arange(256, dtype=np.uint8)[:, None]
-    return np.asarray(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[:, 0, ::-1], np.uint8)
