@@ -24,7 +24,7 @@ import numpy as np
 import phone
 import unusual
 from tofuse.apps.api.result import Result, reconstruct
-from tofuse.apps.coach import LengthErrors
+from tofuse.apps.certainty import LengthErrors
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame

@@ -20,8 +20,8 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse._version import __version__
     from tofuse.apps.api.result import Mapper, Result, load, merge, reconstruct
+    from tofuse.apps.certainty.lengths import Length
     from tofuse.apps.coach.advice import Advice, advise
-    from tofuse.apps.coach.lengths import Length
     from tofuse.apps.compare.comparing import Comparison, compare
     from tofuse.apps.inspection.inspect import inspect_recording as inspect
     from tofuse.apps.jobs.evaluating import Evaluation, evaluate

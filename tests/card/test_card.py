@@ -175,3 +175,36 @@ def test_false_alarms_are_as_rare_as_stated_whatever_the_scatter(spread: float) 
     assert (p < SIGNIFICANCE).mean() < 1.3 * SIGNIFICANCE
     # A single date has no trend: then it is the scatter that counts.
     assert drift_of(0 * t, draws[0], s, trend=True).change is None
+
+
+@pytest.mark.parametrize("spread", [1.0, 3.0])
+def test_detectable_change_is_found_as_often_as_stated(spread: float) -> None:
+    rng = np.random.default_rng(2)
+    t, s = np.linspace(0, 1, 12), np.ones(12)
+    draws = spread * rng.normal(size=(1000, 12))
+    limit = np.median([drift_of(t, y, s, trend=True).detectable(2) for y in draws])
+    found = [drift_of(t, y + limit * t, s, trend=True).p_alone < SIGNIFICANCE / 2 for y in draws]
+    assert np.mean(found) == pytest.approx(0.95, abs=0.04)
+    # Four times as many results find half the change, and more, as they know their scatter better.
+    few = drift_of(t, draws[0], s, trend=True)
+    assert 0.4 < few.detectable(2, 4) / few.detectable(2) < 0.5
+
+
+def test_card_says_which_change_of_the_range_it_would_find(tmp_path: Path) -> None:
+    card = make_card(campaign(tmp_path))
+    (said,) = [w for w in card.warnings if w.startswith("A change of the range offset is found")]
+    offset, tests = card.drifts["offset"], len(card.drifts)
+    assert f"from {1e3 * offset.detectable(tests):.1f} mm on; 5.0 mm would take" in said
+    times, rest = divmod(int(said.split("would take ")[1].split()[0]), 8)
+    assert rest == 0
+    assert offset.detectable(tests, times) <= 0.005 < offset.detectable(tests, times - 1)
+
+
+def test_rising_noise_is_found(tmp_path: Path) -> None:
+    results = campaign(tmp_path)
+    rng = np.random.default_rng(3)
+    for k, result in enumerate(results):
+        rms = 0.004 * (1 + 0.1 * k) * rng.uniform(0.95, 1.05, 30)
+        frames = json.loads((result / "run.json").read_text())["frames"]
+        change_run(result, frames=[frames[0] | {"rms_m": float(each)} for each in rms])
+    assert make_card(results).changed == ["rms"]

@@ -45,8 +45,8 @@ def test_scene_has_the_surface_and_the_brightness_of_the_scan() -> None:
 def test_binned_camera_sees_the_same_with_less_noise(name: str) -> None:
     model = camera_model(name)
     binned = model.binned(100)
-    n = -(-model.camera.width // 100)
-    assert binned.camera.width == model.camera.width // n <= 100
+    n = round(model.camera.width / 100)
+    assert binned.camera.width == model.camera.width // n <= 150
     # The ray of a binned pixel is the mean of those that it sums.
     full, rays = model.camera.rays().astype(float), binned.camera.rays()
     row, column = binned.camera.height // 2, binned.camera.width // 2
@@ -80,10 +80,10 @@ def test_planned_frames_are_as_dense_as_the_motion_needs() -> None:
 
 
 def test_decisions() -> None:
-    assert planning._decision(0.0031, 0.005) == "enough"
+    assert planning._decision(0.0029, 0.005) == "enough"
     assert planning._decision(0.0045, 0.005) == "undecided"
     assert planning._decision(0.0075, 0.005) == "undecided"
-    assert planning._decision(0.0085, 0.005) == "not enough"
+    assert planning._decision(0.0087, 0.005) == "not enough"
     assert planning._decision(np.inf, 0.005) == "not enough"
 
 

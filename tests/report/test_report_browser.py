@@ -11,7 +11,7 @@ import pytest
 
 from browser import changed, chromium, watched
 from report_results import make_room
-from tofuse.apps.coach import LengthErrors
+from tofuse.apps.certainty import LengthErrors
 from tofuse.apps.report.html import asset
 from tofuse.apps.report.section_model import packed_lengths
 from tofuse.apps.report.sections import write_report

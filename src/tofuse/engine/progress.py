@@ -26,11 +26,14 @@ class OnlineMap:
         (N,) s, of its vertices.
     views
         Prepared views of some of them.
+    degenerate
+        Indices of the frames whose registration left some direction open.
     """
 
     graph: PoseGraph
     timestamps: Float64
     views: Sequence[PosedView[PreparedView]]
+    degenerate: frozenset[int] = frozenset()
 
 
 class Progress(Protocol):

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
+from tofuse.apps.certainty import Length, LengthErrors
 from tofuse.apps.cli import TerminalProgress
-from tofuse.apps.coach import Length, LengthErrors
 from tofuse.apps.jobs import (
     Evaluation,
     evaluate,

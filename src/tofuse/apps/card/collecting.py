@@ -8,10 +8,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tofuse.apps.results import folders, reopening, run_json
+from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, Recording
+from tofuse.engine.normal import robust_sigma
 from tofuse.engine.refinement import calibration_check
 from tofuse.formats.cameras import pinhole_of
 
@@ -95,6 +99,7 @@ def _read(folder: Path) -> tuple[Identity, Session]:
     with run_json.opened(folder) as run:
         parts = list(reopening.stored_recordings(folder, run))
         check = (run.get("refinement") or {}).get("suspicion") or {}
+        rms = np.array([frame["rms_m"] for frame in run["frames"] if frame.get("rms_m")])
         estimates = {name: tuple(pair) for name, pair in check.get("estimates", {}).items()}
     if len(parts) > 1 or run.get("rig"):
         raise InputError(
@@ -112,13 +117,16 @@ def _read(folder: Path) -> tuple[Identity, Session]:
         (frame.camera.width, frame.camera.height),
     )
     corrections = {each["part"]: each for each in part.config.get("corrections", [])}
-    values = values_of(estimates, corrections, pinhole_of(frame.camera))
+    values = values_of(estimates, corrections, pinhole_of(frame.camera), rms)
     time, by_file = _time_of(recording, reopening.locate_recording(part.opening, folder).paths[0])
     return identity, Session(str(folder), time, by_file, values, _noise(corrections))
 
 
 def values_of(
-    estimates: Mapping[str, tuple[float, float]], corrections: Mapping[str, Any], camera: Pinhole
+    estimates: Mapping[str, tuple[float, float]],
+    corrections: Mapping[str, Any],
+    camera: Pinhole,
+    rms_m: Float64,
 ) -> dict[str, tuple[float, float]]:
     """Return value and sigma of the camera's properties that a result states.
 
@@ -130,6 +138,9 @@ def values_of(
         Its corrections by the name of the part, as in `run.json`.
     camera
         As its recording states it.
+    rms_m
+        (N,) of the alignment of each frame. It counts if other quantities do; another place differs
+        as the frames of this one do from each other.
     """
     corrected = corrections.get("camera-errors", {})
     # Value without an error, and its change by a unit of it.
@@ -151,6 +162,9 @@ def values_of(
     strength = corrections.get("multipath", {}).get("strength")
     if strength is not None and strength[1] > 0:
         values["multipath"] = float(strength[0]), float(strength[1])
+    spread = robust_sigma(rms_m - np.median(rms_m)) if values and len(rms_m) else 0.0
+    if spread > 0:
+        values["rms"] = float(np.median(rms_m)), spread
     return values
 
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc, stdtr
+from scipy.special import chdtrc, stdtr, stdtrit
 
 from tofuse.engine.arrays import Float64
 
@@ -49,6 +49,18 @@ class Drift:
     p_change: float
     p_trend: float
     p: float = 1.0
+
+    def detectable(self, tests: int, more: int = 1) -> float:
+        """Change over the time of which a trend is found in 95 % of such cameras.
+
+        Among some tests, each at its share of 5 %, and with `more` times as many results; NaN where
+        no trend was tested.
+        """
+        if self.change_sigma is None:
+            return np.nan
+        dof = more * self.results - 2
+        found = stdtrit(dof, 1 - 0.025 / tests) + stdtrit(dof, 0.95)
+        return float(self.change_sigma * found / np.sqrt(more))
 
     @property
     def p_alone(self) -> float:

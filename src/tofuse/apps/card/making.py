@@ -20,6 +20,8 @@ from tofuse.engine.errors import InputError
 SIGNIFICANCE = 0.05
 # Fewer results can't show a scatter beyond their sigmas, so a trend among them is not tested alone.
 _MIN_TREND = 4
+# A change of the range that matters to most, and multiples of the results that are thought of.
+_WANTED_M, _MANY = 0.005, 200
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ QUANTITIES = {
     "center_y": Quantity("Principal point y", "px", 1.0, 2),
     "distortion": Quantity("Unstated distortion", "", 1.0, 4),
     "multipath": Quantity("Multipath strength", "", 1.0, 3),
+    "rms": Quantity("Noise of alignments", "mm", 1e3, 1),
 }
 
 
@@ -169,6 +172,9 @@ def _warnings(card: Card) -> Iterator[str]:
             f"Results scatter by more than their sigmas: {', '.join(scattered)}. Scenes differ in "
             "multipath and mixed pixels, so repeat one scene to learn more"
         )
+    offset = card.drifts.get("offset")
+    if offset is not None and offset.change is not None and "offset" not in card.changed:
+        yield _not_found(offset, len(card.drifts))
     if len(card.sessions) < _MIN_TREND:
         yield f"Fewer than {_MIN_TREND} results: their scatter is taken to be twice their sigmas"
     if any(session.by_file for session in card.sessions):
@@ -178,6 +184,19 @@ def _warnings(card: Card) -> Iterator[str]:
     silent = sum(not session.values for session in card.sessions)
     if silent:
         yield f"{silent} of {len(card.sessions)} results state no estimates of the camera"
+
+
+def _not_found(offset: Drift, tests: int) -> str:
+    """Say which change of the ranges would be found, and what would find a smaller one."""
+    text = QUANTITIES["offset"].text
+    more = next((k for k in range(1, _MANY) if offset.detectable(tests, k) <= _WANTED_M), _MANY)
+    found = f"A change of the range offset is found from {text(offset.detectable(tests))} on"
+    if more == 1:
+        return found
+    return (
+        f"{found}; {text(_WANTED_M)} would take {'over ' * (more == _MANY)}"
+        f"{more * offset.results} results, or a wall at a measured distance"
+    )
 
 
 def _words(name: str, drift: Drift) -> str:

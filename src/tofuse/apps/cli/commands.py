@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from tofuse.apps.jobs import Options
     from tofuse.apps.viewer import LiveMap, ReportServer
+    from tofuse.engine.arrays import Bool
     from tofuse.engine.graph import Optimisation, PoseGraph, certificate
 
 _Options = TypeVar("_Options", bound="DataclassInstance")
@@ -550,6 +551,8 @@ def evaluate(arguments: cli.Evaluate) -> int:
 
 def optimize(arguments: cli.Optimize) -> int:
     """``tofuse optimize``."""
+    import numpy as np
+
     from tofuse.apps.calibration import check_new
     from tofuse.engine.graph import certificate, graph_covariances
     from tofuse.engine.mapping import changed, from_method
@@ -568,6 +571,9 @@ def optimize(arguments: cli.Optimize) -> int:
     solution = config.optimiser.optimise(graph)
     write_g2o(arguments.out, solution.graph)
     certified = certificate.certify(graph_covariances.accepted_only(solution).graph)
+    kept = (
+        np.ones(len(graph.edges), np.bool_) if solution.weights is None else solution.weights >= 0.5
+    )
     data = {
         "out": str(arguments.out),
         "poses": len(graph.ids),
@@ -577,29 +583,20 @@ def optimize(arguments: cli.Optimize) -> int:
         "iterations": max(len(solution.objective) - 1, 0),
         "converged": solution.converged,
         "improved": solution.improved,
-        "rejected": _rejected(solution),
+        "rejected": graph.ids[graph.edges[~kept]].tolist(),
         "certificate": certified and certified.to_dict(),
     }
-    return show(arguments, data, *_optimised(graph, solution), *_certified(certified))
+    return show(arguments, data, *_optimised(graph, solution, kept), *_certified(certified))
 
 
-def _rejected(solution: Optimisation) -> list[tuple[int, int]]:
-    """Return the ids of the ends of rejected edges."""
-    if solution.weights is None:
-        return []
-    rejected = solution.graph.edges[solution.weights < 0.5]
-    return [(int(i), int(j)) for i, j in solution.graph.ids[rejected]]
-
-
-def _optimised(graph: PoseGraph, solution: Optimisation) -> Iterator[str]:
+def _optimised(graph: PoseGraph, solution: Optimisation, kept: Bool) -> Iterator[str]:
     yield (
         f"{len(graph.ids)} poses, {len(graph.edges)} edges: squared error {graph.chi2():.6g} "
         f"to {solution.graph.chi2():.6g} in {max(len(solution.objective) - 1, 0)} iterations"
         + ("" if solution.converged else " (not converged)")
     )
-    count = len(_rejected(solution))
-    if solution.weights is not None and count:
-        kept = solution.weights >= 0.5
+    count = int((~kept).sum())
+    if count:
         yield (
             f"{count} edge{'' if count == 1 else 's'} rejected as inconsistent with the others; "
             f"squared error of the others {graph.chi2(kept):.6g} to {solution.graph.chi2(kept):.6g}"

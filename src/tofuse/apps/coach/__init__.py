@@ -1,9 +1,7 @@
 """What to scan next, so that the bound on the errors of the poses falls.
 
-The next best view by information: `Known` is what is known at a moment, surfaces and the joint
-covariance of keyframes; `advise` imagines views from other poses, predicts the information of their
-pairs with the keyframes, and returns the `Advice` whose bound is lowest. From what is known,
-`LengthErrors` says how well the distance of two points is.
+The next best view by information: `advise` imagines views from other poses, predicts what their
+pairs with the keyframes would tell, and returns the `Advice` whose bound is lowest.
 """
 
 from typing import TYPE_CHECKING
@@ -12,6 +10,5 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.apps.coach.advice import Advice, advise, advise_on
-    from tofuse.apps.coach.lengths import Length, LengthErrors
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -14,7 +14,15 @@ from tofuse.apps.export.mcap_file import write_mcap
 from tofuse.apps.export.nerfstudio import write_nerfstudio
 from tofuse.apps.export.rerun_file import write_rerun
 from tofuse.apps.export.scene import Scene
-from tofuse.apps.results import folders, read_cloud, read_mesh, run_json, textured_record
+from tofuse.apps.results import (
+    DISPLAY_FACES,
+    TEXTURE_SIZE,
+    folders,
+    read_cloud,
+    read_mesh,
+    run_json,
+    textured_record,
+)
 from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.fusion import GeometryRecord, Mesh, texture
@@ -24,14 +32,12 @@ from tofuse.formats.geometry import read_textured_glb
 from tofuse.formats.images import jpeg_bytes
 from tofuse.formats.poses import associate, read_tum, write_kitti, write_log
 
-# Default number of triangles, and the maximum size of a .glb with their texture.
-FACES = 60_000
+# Maximum size of a .glb with a texture.
 _MAX_BYTES = 8_000_000
 _VERTEX_BYTES, _FACE_BYTES, _OTHER_BYTES = 32, 12, 4096
 _QUALITIES = (92, 85, 75, 60, 40)
 # Texture layout takes minutes for more faces.
 _MAX_TEXTURED_FACES = 120_000
-_TEXTURE_SIZE = 2048
 
 
 @dataclass(frozen=True)
@@ -96,11 +102,11 @@ class _Result:
                 return record
             normals = None if record.normals is None else record.normals @ self.R_up_world
             return replace(record, points=record.points @ self.R_up_world, normals=normals)
-        max_faces = self.faces or FACES
+        max_faces = self.faces or DISPLAY_FACES
         n_faces = min(max_faces, len(self.mesh.faces))
         if self.mesh.color is None or not 0 < n_faces <= _MAX_TEXTURED_FACES:
             return self.mesh.decimated(max_faces).record()
-        baked = texture.baked(self.mesh, max_faces, _TEXTURE_SIZE)
+        baked = texture.baked(self.mesh, max_faces, TEXTURE_SIZE)
         rows, faces = baked.atlas.vertices, baked.atlas.faces
         other_bytes = _VERTEX_BYTES * len(rows) + _FACE_BYTES * len(faces) + _OTHER_BYTES
         return textured_record(baked, _jpeg(baked.image, other_bytes))
@@ -203,7 +209,7 @@ def export(
     out
         Folder for the files; by default that of the result.
     faces
-        Maximum number of triangles; by default `FACES`, for STL all.
+        Maximum number of triangles; by default those of `mesh.glb`, for STL all.
     every
         Every n-th of the images with a pose.
     pinhole

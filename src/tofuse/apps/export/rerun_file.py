@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from tofuse.apps.export.scene import Scene
+from tofuse.apps.results import viridis
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.fusion import display_colors
@@ -102,10 +103,6 @@ def _pinhole(rr: Any, camera: Pinhole) -> Any:
 
 def _colors(sigma: Float32) -> UInt8:
     """(N, 3) colours: dark where sigma is small, yellow from its 95th percentile on."""
-    import cv2
-
-    known = np.nan_to_num(sigma, nan=np.inf)
-    finite = known[np.isfinite(known)]
+    finite = sigma[np.isfinite(sigma)]
     largest = float(np.percentile(finite, _MAX_SIGMA_PERCENTILE)) if len(finite) else 1.0
-    levels = (255 * np.clip(known / (largest or 1.0), 0, 1)).astype(np.uint8)
-    return np.asarray(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[:, 0, ::-1], np.uint8)
+    return viridis(np.nan_to_num(sigma.astype(float), nan=np.inf) / (largest or 1.0))

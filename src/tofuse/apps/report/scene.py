@@ -11,13 +11,13 @@ import numpy as np
 
 from tofuse.apps.report import thumbnails
 from tofuse.apps.report.packing import normal_bytes, pack, quantized
+from tofuse.apps.results import QUALITY, viridis
 from tofuse.engine.arrays import Float32, Float64, Int32, Intp, UInt8, UInt16
 from tofuse.engine.fusion import Cloud, Mesh, Textured, display_colors
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.images import jpeg_bytes
 
 MAX_POINTS = 150_000
-JPEG_QUALITY = 88  # of a texture
 _MAX_SEGMENTS = 1000  # segments of a trajectory
 _MAX_EXTENT_RATIO = 1.8  # of model and cameras to the model; beyond, cameras are not framed
 _MAX_NORMALS, _MIN_AREA_RATIO = 5000, 1.05  # sampled normals; area to the default view's
@@ -244,7 +244,7 @@ def _packed_texture(texture: Textured | None) -> dict[str, Any]:
     if texture is None:
         return {"uv": None, "texture": None, "filled": 0}
     uv = quantized(texture.atlas.uv.astype(float), np.zeros(2), np.ones(2))
-    image = base64.b64encode(jpeg_bytes(texture.image, JPEG_QUALITY)).decode()
+    image = base64.b64encode(jpeg_bytes(texture.image, QUALITY)).decode()
     return {
         "uv": pack(uv),
         "texture": f"data:image/jpeg;base64,{image}",
@@ -351,7 +351,7 @@ def _colors(cloud: Cloud, sampled: Intp, points: Float64) -> UInt8:
 def height_colors(points: Float64) -> UInt8:
     """Return colours (N, 3) of points by height, which is -y."""
     low, high = thumbnails.percentile_range(-points[:, 1])
-    return thumbnails.viridis(0.1 + 0.9 * (-points[:, 1] - low) / max(high - low, 1e-6))
+    return viridis(0.1 + 0.9 * (-points[:, 1] - low) / max(high - low, 1e-6))
 
 
 def spacing_of(points: Float64) -> float:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.apps.coach import LengthErrors
+from tofuse.apps.certainty import LengthErrors
 from tofuse.apps.report import plots, thumbnails, words
 from tofuse.apps.report.fields import accuracy, fields
 from tofuse.apps.report.packing import pack

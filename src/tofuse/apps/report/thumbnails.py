@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.apps.results import viridis
 from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
 from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.engine.geometry import se3
@@ -19,20 +19,6 @@ REMOVED = (225, 40, 135)  # removed by the filter shown; not in the colour map
 BACKGROUND = (22, 25, 30)  # of the 3D view
 _SPLATS = 60_000  # points of a cloud that are drawn, at least
 _MIN_DEPTH = 0.02  # of the eye's distance; nearer points are not drawn
-
-
-def viridis(value: Float64) -> UInt8:
-    """Return viridis colours (..., 3) of values from 0 to 1: near is dark, far is bright."""
-    return _ramp()[np.round(255 * np.clip(np.nan_to_num(value), 0, 1)).astype(np.intp)]
-
-
-@cache
-def _ramp() -> UInt8:
-    """The 256 colours of the map, (256, 3) RGB."""
-    import cv2
-
-    levels = np.arange(256, dtype=np.uint8)[:, None]
-    return np.asarray(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[:, 0, ::-1], np.uint8)
 
 
 def css(color: Sequence[int]) -> str:

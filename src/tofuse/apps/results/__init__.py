@@ -12,6 +12,14 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.apps.results import folders, integrity, reopening, run_json
     from tofuse.apps.results.loading import load_result, read_cloud, read_mesh, stated_accuracy
-    from tofuse.apps.results.output import CHANGE_COLORS, textured_record, write_result
+    from tofuse.apps.results.output import (
+        CHANGE_COLORS,
+        DISPLAY_FACES,
+        QUALITY,
+        TEXTURE_SIZE,
+        textured_record,
+        viridis,
+        write_result,
+    )
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from tofuse._version import __version__
 from tofuse.apps.results.folders import OutputFolder, component_name
 from tofuse.apps.results.run_json import write_run_json
-from tofuse.engine.arrays import Float64
+from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.compute import job_pool
 from tofuse.engine.fusion import GeometryRecord, Mesh, Textured, display_colors, texture
 from tofuse.engine.geometry import se3
@@ -27,8 +28,8 @@ from tofuse.formats.poses import write_g2o, write_tum
 CHANGE_COLORS = {"appeared": (230, 97, 0), "vanished": (93, 58, 155)}
 
 # Of a simplified surface whose texture is made of the colours of its vertices.
-DISPLAY_FACES, _TEXTURE_SIZE = 60_000, 2048
-QUALITY = 90  # of a texture as JPEG
+DISPLAY_FACES, TEXTURE_SIZE = 60_000, 2048
+QUALITY = 88  # of a texture as JPEG
 Report = Callable[[Reconstruction, Path], None]
 MAX_PLY_POINTS = 4_000_000  # a larger cloud is compressed
 
@@ -166,7 +167,7 @@ def display_record(mesh: Mesh, faces: int = DISPLAY_FACES) -> GeometryRecord:
     """Return a simplified surface with the colours of its vertices in a texture."""
     if mesh.color is None:
         mesh = replace(mesh, color=np.zeros_like(mesh.vertices, np.uint8))
-    return textured_record(texture.baked(mesh, faces, _TEXTURE_SIZE))
+    return textured_record(texture.baked(mesh, faces, TEXTURE_SIZE))
 
 
 def textured_record(texture: Textured, jpeg: bytes | None = None) -> GeometryRecord:
@@ -179,3 +180,17 @@ def textured_record(texture: Textured, jpeg: bytes | None = None) -> GeometryRec
         uv=texture.atlas.uv,
         texture=jpeg or jpeg_bytes(texture.image, QUALITY),
     )
+
+
+def viridis(value: Float64) -> UInt8:
+    """Return viridis colours (..., 3) of values from 0 to 1: near is dark, far is bright."""
+    return _ramp()[np.round(255 * np.clip(np.nan_to_num(value), 0, 1)).astype(np.intp)]
+
+
+@cache
+def _ramp() -> UInt8:
+    """The 256 colours of the map, (256, 3) RGB."""
+    import cv2
+
+    levels = np.arange(256, dtype=np.uint8)[:, None]
+    return np.asarray(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[:, 0, ::-1], np.uint8)

@@ -346,8 +346,23 @@ def _registered_scaled(
 
 def _thinned(view: Frame, scale: float) -> CloudFrame:
     """Return a view as a scaled cloud of few points."""
-    points = view.points[:: -(-len(view) // _UNIT_POINTS)] * np.float32(scale)
-    return CloudFrame(view.index, view.timestamp, points, origin=scale * view.origin)
+    step = -(-len(view) // _UNIT_POINTS)
+    return scaled(view, scale).keep(np.arange(len(view)) % step == 0)
+
+
+def scaled(view: Frame, scale: float) -> CloudFrame:
+    """Return the points of a view, scaled about the origin of their coordinates."""
+    points = view.points * np.float32(scale)
+    return CloudFrame(
+        view.index,
+        view.timestamp,
+        points,
+        normals=view.normals if isinstance(view, CloudFrame) else None,
+        color=view.color,
+        amplitude=view.amplitude,
+        origin=scale * view.origin,
+        shift=scale * view.shift,
+    )
 
 
 def with_cloud_information(

@@ -18,7 +18,7 @@ import numpy as np
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds.cloud_agreement import CloudMap, both_supports
-from tofuse.engine.clouds.cloud_pair import register_clouds
+from tofuse.engine.clouds.cloud_pair import register_clouds, scaled
 from tofuse.engine.clouds.fpfh import POINTS, candidates
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame
@@ -59,21 +59,6 @@ class _Similarity:
     T: Float64
     support: float = 0.0
     sigma: float = np.inf
-
-
-def scaled(view: Frame, scale: float) -> CloudFrame:
-    """Return the points of a view, scaled about the origin of their coordinates."""
-    points = view.points * np.float32(scale)
-    return CloudFrame(
-        view.index,
-        view.timestamp,
-        points,
-        normals=view.normals if isinstance(view, CloudFrame) else None,
-        color=view.color,
-        amplitude=view.amplitude,
-        origin=scale * view.origin,
-        shift=scale * view.shift,
-    )
 
 
 def register_similar(source: Frame, target: Frame, rng: np.random.Generator) -> Scaled:

@@ -260,7 +260,9 @@ class Mapper:
         graph = self._live_poses.graph(self._component, log)
         times = {e.record.index: e.record.timestamp for e in log.entries}
         views = [v for v in self.views if v.component == self._component]
-        return OnlineMap(graph, np.array([times[i] for i in graph.ids.tolist()]), views)
+        degenerate = frozenset(e.record.index for e in log.entries if len(e.record.unobservable))
+        timestamps = np.array([times[i] for i in graph.ids.tolist()])
+        return OnlineMap(graph, timestamps, views, degenerate)
 
     def finish(self) -> Reconstruction:
         """Join components, close loops, optimise, refine, fuse and judge.

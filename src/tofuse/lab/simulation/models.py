@@ -109,8 +109,8 @@ class CameraModel:
     drift_time_s: float = 240.0
 
     def binned(self, columns: int) -> Self:
-        """Return the camera with squares of pixels summed, so that it has at most `columns`."""
-        n = -(-self.camera.width // columns)
+        """Return the camera with squares of pixels summed, so that it has about `columns`."""
+        n = max(1, round(self.camera.width / columns))
         lens = self.camera
         camera = replace(
             lens,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
-from tofuse.apps.coach.known import Known
+from tofuse.apps.certainty.known import Known
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame
@@ -170,10 +170,7 @@ def _covariance(known: Known, result: Reconstruction) -> Float64:
     records = {r.index: r.covariance for r in result.diagnostics.frames}
     unbounded = np.isin(known.frames, accuracy.unbounded)
     total = sum(cause**2 for cause in accuracy.causes_m.values())
-    # Unbounded keyframes share their error up to the next frame with a degenerate direction.
-    degenerate = [r.index for r in result.diagnostics.frames if len(r.unobservable)]
-    part = np.searchsorted(degenerate, known.frames, side="right")
-    lost = unbounded[:, None] & unbounded & (part[:, None] == part)
+    lost = unbounded[:, None] & unbounded & (known.parts[:, None] == known.parts)
     codes = {reason.code for reason in result.diagnostics.reasons}
     if total:
         C = C * (total / known.mean_square)

@@ -8,11 +8,12 @@ from typing import Self
 
 import numpy as np
 
-from tofuse.apps.coach.surfaces import Seen, Surfaces, pair_information, scales
+from tofuse.apps.certainty.surfaces import Seen, Surfaces, pair_information, scales
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.frames import Frame, RangeFrame, evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import PoseGraph, graph_covariances
+from tofuse.engine.graph import PoseGraph, graph_covariances, sparse
 from tofuse.engine.progress import OnlineMap
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.refinement import joint_alignment, pairwise_measurements
@@ -26,6 +27,13 @@ _PAIRS_SAMPLED = 10
 # Pairs are selected and compared as by the refinement, at the present poses.
 _ALIGNMENT = pair_equations.RefineOptions(rounds=(pair_equations.Round(2, 0.0, 0.0),), points=600)
 _OVERLAP, _NEIGHBOURS = _ALIGNMENT.overlap, _ALIGNMENT.neighbours
+# What an alignment takes for constrained, and for a tilt that both views share.
+_TRACKING = projective.ProjectiveOptions()
+# Errors of a motion above which it counts as not bounded.
+_LIMITS = np.array([_TRACKING.prior_m, _TRACKING.prior_rad])
+# Variance of motions that no measurement bounds: m^2 and rad^2. Far above any bound, and not so far
+# that the rest is lost to rounding.
+_OPEN = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,38 +45,52 @@ class Known:
     Attributes
     ----------
     surfaces, responses
-        Known surfaces, and `Surfaces.responses`.
+        Known surfaces, and `Surfaces.responses` along the normal, along the surface where its
+        brightness told something, and along all surfaces.
+    now
+        (4, 4) latest pose.
     poses, ages_s, frames
         (K, 4, 4), (K,) time since then, and (K,) frame indices.
     centre
         (3,) mean of the positions in the world; `poses` and `surfaces` are relative to it.
     seen
         What they see.
-    covariance
-        (6K, 6K) of their motions.
+    covariance, opened
+        (6K, 6K) of their motions, with the predicted ones where none was measured; and where these
+        are free.
+    parts, is_open
+        (K,) number of the part of each: no measurement bounds the motion between two parts; and
+        whether its own motion is bounded only by that of its neighbours.
     scales
         (2,) see `surfaces.scales`.
     partners
         (K,) number of views that each one is compared with: pairs of a view share its errors.
     views_each
         Number of views that each keyframe stands for.
-    bound_m, other_squares
-        Present 95 % bound; and the part of its square that is due to the calibration of the camera,
-        which more views don't improve, relative to the rest.
+    bound_m, quantile
+        Present 95 % bound, and that of an rms error of 1.
+    other_squares
+        The part of its square that is due to the calibration of the camera, which more views don't
+        improve, relative to the rest.
     """
 
     surfaces: Surfaces
     responses: Float32
+    now: Float64
     poses: Float64
     ages_s: Float64
     frames: Intp
     centre: Float64
     seen: Seen
     covariance: Float64
+    opened: Float64
+    parts: Intp
+    is_open: Bool
     scales: Float64
     partners: Float64
     views_each: float
     bound_m: float
+    quantile: float
     other_squares: float = 0.0
 
     @classmethod
@@ -86,8 +108,14 @@ class Known:
         surfaces = Surfaces.of_views([views[k] for k in chosen], graph.poses[positions])
         sampled = _measured_pairs([views[k] for k in chosen], graph.poses[positions])
         each = len(views) / len(chosen)
-        found = cls._of_graph(graph, positions, known.timestamps, surfaces, centre, each, sampled)
-        return None if found is None else found._with_pairs()
+        is_open = np.isin(graph.ids, [*known.degenerate])
+        ends = is_open[graph.edges]
+        bounded = ~np.where(graph.loop, ends.any(1), ends[:, 1])
+        parts = sparse.parts_of(len(graph.ids), graph.edges[bounded])
+        found = cls._of_graph(
+            graph, positions, known.timestamps, surfaces, centre, each, sampled, parts, is_open
+        )
+        return None if found is None else found.steady()._with_pairs()
 
     @classmethod
     def of_result(cls, result: Reconstruction, frame: Frame | None) -> Self | None:
@@ -111,6 +139,7 @@ class Known:
             np.asarray(points - centre, np.float32), normals, graph.poses[positions], field
         )
         time = {r.index: r.timestamp for r in result.diagnostics.frames}
+        unobservable = {r.index: r.unobservable for r in result.diagnostics.frames}
         times = np.array([time[i] for i in graph.ids.tolist()])
         each = len(core) / len(positions)
         among = np.flatnonzero((degree[graph.edges] > 1).all(1))
@@ -121,7 +150,13 @@ class Known:
             graph.poses[j],
             graph.information[edges] * (0.5 * (degree[i] + degree[j]))[:, None, None],
         )
-        found = cls._of_graph(graph, positions, times, surfaces, centre, each, sampled)
+        # Unbounded frames share their error up to the next one with a degenerate direction.
+        is_open = np.array([len(unobservable[i]) > 0 for i in graph.ids.tolist()])
+        unbounded = np.isin(graph.ids, result.diagnostics.accuracy.unbounded)
+        parts = np.where(unbounded, 1 + np.cumsum(is_open), 0)
+        found = cls._of_graph(
+            graph, positions, times, surfaces, centre, each, sampled, parts, is_open
+        )
         if found is None:
             return None
         found = replace(
@@ -146,6 +181,8 @@ class Known:
         centre: Float64,
         each: float,
         sampled: _Pairs,
+        parts: Intp,
+        is_open: Bool,
     ) -> Self | None:
         positions = np.union1d(positions, [len(graph.ids) - 1])
         C = graph_covariances.GraphCovariances(graph).joint(positions)
@@ -154,22 +191,56 @@ class Known:
         poses, k = graph.poses[positions], len(positions)
         A = se3.adjoint(poses)
         blocks = A[:, None] @ C.reshape(k, 6, k, 6).swapaxes(1, 2) @ np.swapaxes(A, 1, 2)[None]
-        responses = surfaces.responses()
+        C = blocks.swapaxes(1, 2).reshape(6 * k, 6 * k)
+        opened = evenly_spaced(np.flatnonzero(is_open), _KEYFRAMES)
+        plain = (surfaces.seen_from(graph.poses[opened]).pixels > 0).any(axis=0)
+        responses = surfaces.responses(np.asarray(plain, np.bool_))
         known = cls(
             surfaces,
             responses,
+            poses[-1],
             poses,
             times[-1] - times[positions],
             graph.ids[positions],
             centre,
             surfaces.seen_from(poses),
-            blocks.swapaxes(1, 2).reshape(6 * k, 6 * k),
+            C,
+            C,
+            parts[positions],
+            is_open[positions],
             sampled.scales(surfaces, responses),
             np.ones(k),
             each,
             0.0,
+            0.0,
         )
-        return replace(known, bound_m=known.bound(known.covariance))
+        bound_m = known.bound(known.covariance)
+        return replace(
+            known,
+            bound_m=np.inf if len(np.unique(known.parts[~known.is_open])) > 1 else bound_m,
+            quantile=bound_m / max(known.mean_square, 1e-30) ** 0.5,
+        )
+
+    def steady(self) -> Self:
+        """Return it without keyframes that only their neighbours bound, if there are others."""
+        rows = np.flatnonzero(~self.is_open)
+        if not self.is_open.any() or len(rows) < 2:
+            return self
+        which = (6 * rows[:, None] + np.arange(6)).ravel()
+        C, parts = self.covariance[np.ix_(which, which)], self.parts[rows]
+        names = ("poses", "ages_s", "frames", "parts", "is_open", "partners")
+        return replace(
+            self,
+            seen=self.seen.of(rows),
+            covariance=C,
+            opened=C + np.kron(parts[:, None] == parts, _OPEN * np.eye(6)),
+            **{name: getattr(self, name)[rows] for name in names},
+        )
+
+    @property
+    def gaps(self) -> Intp:
+        """Positions of keyframes, the motion from which to the next one is not bounded."""
+        return np.flatnonzero((self._step_squares(self.opened) > _LIMITS**2).any(1))
 
     def _with_pairs(self) -> Self:
         """Return it with all pairs of keyframes that overlap, as the refinement will compare."""
@@ -180,13 +251,15 @@ class Known:
             return self
         partners = np.maximum(np.bincount(pairs.ravel(), minlength=len(self.poses)), 1.0)
         i, j = pairs.T
-        H = self._information(self.seen.of(i), self.seen.of(j))
+        H = self._information(self.seen.of(i), self.seen.of(j), self.poses[j])
         H *= (self.views_each / (0.5 * (partners[i] + partners[j])))[:, None, None]
         L = _laplacian(len(self.poses), pairs, H)
-        n = len(L)
-        C = np.linalg.solve(np.eye(n) + self.covariance @ L, self.covariance)
-        known = replace(self, covariance=0.5 * (C + C.T), partners=partners)
-        return replace(known, bound_m=known.bound(known.covariance))
+        solved = [
+            np.linalg.solve(np.eye(len(L)) + C @ L, C) for C in (self.covariance, self.opened)
+        ]
+        C, opened = (0.5 * (C + C.T) for C in solved)
+        known = replace(self, covariance=C, opened=opened, partners=partners)
+        return replace(known, bound_m=np.inf if len(known.gaps) else known.bound(known.covariance))
 
     @property
     def _jacobians(self) -> Float64:
@@ -220,22 +293,59 @@ class Known:
     @property
     def step_squares(self) -> Float64:
         """(K - 1,) mean squares of the errors of position from each keyframe to the next."""
+        return self._step_squares(self.covariance)[:, 0]
+
+    def _step_squares(self, covariance: Float64) -> Float64:
+        """(K - 1, 2) mean squares of the errors from each keyframe to the next: m^2 and rad^2."""
         k = len(self.poses)
         D = np.kron(np.diff(np.eye(k), axis=0), np.eye(6))
-        blocks = (D @ self.covariance @ D.T).reshape(k - 1, 6, k - 1, 6)
+        blocks = (D @ covariance @ D.T).reshape(k - 1, 6, k - 1, 6)
         C = blocks[np.arange(k - 1), :, np.arange(k - 1), :]
         J = self._jacobians[1:]
-        return np.asarray(np.einsum("kij,kjl,kil->k", J, C, J), np.float64)
+        of_rotations = np.trace(C[:, 3:, 3:], axis1=1, axis2=2)
+        return np.stack([np.einsum("kij,kjl,kil->k", J, C, J), of_rotations], 1)
 
     def bound(self, covariance: Float64) -> float:
         """Return the 95 % bound on the rms error of the positions, by a covariance alone."""
         P = self._to_positions
         return pose_accuracy.bound_by_covariance(P @ covariance @ P.T)
 
-    def factors_with(
+    def expected(
         self, poses: Float64, ways: Sequence[Sequence[int]], views: Sequence[float]
     ) -> Float64:
-        """(W,) factors of the bound after scanning along each of some ways.
+        """(W,) bounds expected after scanning along each of some ways; see `variances`."""
+        P, C = self._to_positions, self.covariance
+        squares = self.variances(poses, ways, views, P, C).sum(1) / len(self.poses)
+        if not np.isfinite(self.bound_m):
+            return self.quantile * np.sqrt(squares)
+        before = self.mean_square
+        ratio = squares / before if before > 0 else np.ones(len(squares))
+        return self.bound_m * np.sqrt((ratio + self.other_squares) / (1 + self.other_squares))
+
+    def open_after(
+        self, poses: Float64, ways: Sequence[Sequence[int]], views: Sequence[float]
+    ) -> Float64:
+        """(W, G) errors of the motion over each gap after each of some ways; see `variances`.
+
+        In units of the limits above which it counts as not bounded.
+        """
+        gaps, k = self.gaps, len(self.poses)
+        J = np.concatenate([self._jacobians[gaps + 1], np.eye(6)[None, 3:].repeat(len(gaps), 0)], 1)
+        P = np.zeros((len(gaps), 6, k, 6))
+        P[np.arange(len(gaps)), :, gaps + 1], P[np.arange(len(gaps)), :, gaps] = J, -J
+        left = self.variances(poses, ways, views, P.reshape(-1, 6 * k), self.opened)
+        of_parts = left.reshape(len(ways), len(gaps), 2, 3).sum(3)
+        return np.sqrt(of_parts / _LIMITS**2).max(2)
+
+    def variances(
+        self,
+        poses: Float64,
+        ways: Sequence[Sequence[int]],
+        views: Sequence[float],
+        P: Float64,
+        C: Float64,
+    ) -> Float64:
+        """(W, R) variances of functions P (R, 6K) of the motions after each of some ways.
 
         Parameters
         ----------
@@ -245,19 +355,22 @@ class Known:
             Positions in `poses` of each way, in its order.
         views
             Numbers of views from the target, the last pose of a way, and from each one before.
+        C
+            (6K, 6K) covariance before.
         """
-        seen, P, C = self.surfaces.seen_from(poses), self._to_positions, self.covariance
+        seen = self.surfaces.seen_from(poses)
         together = np.zeros((len(poses), len(poses)), np.bool_)
         for way in ways:
             together[np.ix_(way, way)] = True
         links = np.argwhere(np.triu(self._overlapping(seen, poses, seen, poses) & together, 1))
-        H_links = self._information(seen.of(links[:, 0]), seen.of(links[:, 1]))
+        ends = seen.of(links[:, 0]), seen.of(links[:, 1])
+        H_links = self._information(*ends, poses[links[:, 1]])
         pairs = np.argwhere(self._overlapping(self.seen, self.poses, seen, poses))
         pairs = joint_alignment.spread_evenly(pairs, _NEIGHBOURS)
-        H_pairs = self._information(self.seen.of(pairs[:, 0]), seen.of(pairs[:, 1]))
+        ends = self.seen.of(pairs[:, 0]), seen.of(pairs[:, 1])
+        H_pairs = self._information(*ends, poses[pairs[:, 1]])
         PC = P @ C
-        before = float((PC * P).sum())
-        squares = np.full(len(ways), before)
+        variances = np.tile((PC * P).sum(1), (len(ways), 1))
         for k, way in enumerate(ways):
             to_known, among = np.isin(pairs[:, 1], way), np.isin(links, way).all(1)
             rows = np.unique(pairs[to_known, 0])
@@ -266,35 +379,44 @@ class Known:
             number = np.zeros(len(poses), np.intp)
             number[list(way)] = len(rows) + np.arange(len(way))
             known = np.searchsorted(rows, pairs[to_known, 0])
-            ends = np.concatenate(
+            edges = np.concatenate(
                 [np.stack([known, number[pairs[to_known, 1]]], 1), number[links[among]]]
             )
             count = len(rows) + len(way)
-            partners = np.bincount(ends.ravel(), minlength=count).astype(float)
+            partners = np.bincount(edges.ravel(), minlength=count).astype(float)
             partners[: len(rows)] = self.partners[rows]
             n_views = np.append(np.full(count - 1, views[1]), views[0])
             n_views[: len(rows)] = np.inf
-            weights = n_views[ends].min(1) / (0.5 * partners[ends].sum(1))
+            weights = n_views[edges].min(1) / (0.5 * partners[edges].sum(1))
             H = np.concatenate([H_pairs[to_known], H_links[among]]) * weights[:, None, None]
-            full, q = _laplacian(count, ends, H), 6 * len(rows)
+            full, q = _laplacian(count, edges, H), 6 * len(rows)
             solved = np.linalg.pinv(full[q:, q:], rcond=1e-12, hermitian=True) @ full[q:, :q]
             L = full[:q, :q] - full[:q, q:] @ solved
             which = (6 * rows[:, None] + np.arange(6)).ravel()
             inner = L @ np.linalg.inv(np.eye(q) + C[np.ix_(which, which)] @ L)
-            squares[k] = before - float(((PC[:, which] @ inner) * PC[:, which]).sum())
-        ratio = np.maximum(squares, 0.0) / before if before > 0 else np.ones(len(squares))
-        return np.asarray(
-            np.sqrt((ratio + self.other_squares) / (1 + self.other_squares)), np.float64
-        )
+            variances[k] -= ((PC[:, which] @ inner) * PC[:, which]).sum(1)
+        return np.maximum(variances, 0.0)
 
     def _overlapping(self, a: Seen, poses: Float64, b: Seen, others: Float64) -> Bool:
         """(M, N) whether views at poses are compared with those at others."""
         similar = poses[:, :3, 2] @ others[:, :3, 2].T > 0
         return np.asarray((a.overlap(b) >= _OVERLAP) & similar, np.bool_)
 
-    def _information(self, a: Seen, b: Seen) -> Float64:
-        """(M, 6, 6) information of pairs of views."""
-        return np.einsum("k,mkab->mab", self.scales, pair_information(a, b, self.responses))
+    def _information(self, a: Seen, b: Seen, poses: Float64) -> Float64:
+        """(M, 6, 6) information of pairs of views, the second ones at poses.
+
+        Where a motion is not bounded, less what a tilt of all normals simulates, as alignments tell
+        a constrained direction.
+        """
+        kinds = pair_information(a, b, self.responses)
+        H = np.einsum("k,mkab->mab", self.scales, kinds[:, :2])
+        if np.isfinite(self.bound_m):
+            return H
+        H -= _TRACKING.common_tilt**2 * self.scales[0] * kinds[:, 2]
+        A = se3.adjoint(poses) * projective.UNITS
+        values, V = np.linalg.eigh(np.swapaxes(A, 1, 2) @ H @ A)
+        B = np.linalg.solve(np.swapaxes(A, 1, 2), V * np.sqrt(np.maximum(values, 0.0))[:, None])
+        return B @ np.swapaxes(B, 1, 2)
 
 
 def _laplacian(count: int, pairs: Intp, H: Float64) -> Float64:
@@ -327,7 +449,7 @@ class _Pairs:
         first, second = surfaces.seen_from(self.first), surfaces.seen_from(self.second)
         A = se3.adjoint(se3.inverse(self.second))
         measured = np.swapaxes(A, 1, 2) @ self.information @ A
-        return scales(measured, pair_information(first, second, responses))
+        return scales(measured, pair_information(first, second, responses)[:, :2])
 
 
 def _measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> _Pairs:

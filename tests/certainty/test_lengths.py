@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.apps.coach import LengthErrors
+from tofuse.apps.certainty import LengthErrors
 from tofuse.engine.errors import InputError
 
 # Three walls in front of the first, of both, and of the second of two cameras that look along z.
