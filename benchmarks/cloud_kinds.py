@@ -38,7 +38,7 @@ _DRIFT = np.array([0.002] * 3 + [0.001] * 3)
 OBJECT_M = 1.6
 # Accuracy of the motion between two poses of the laser on a car, each good to 0.2 m.
 CAR_TRUTH_M = 0.28
-# Pose of the car's scan 3 in the map of the others, from point-to-plane ICP with their joined points
+# Pose of the car's scan 3 in the map of the others, from point-to-plane ICP with all their points
 # (37 % of its points lie within 0.3 m of those; 18 % or less if it is moved by 3 m along the road,
 # 7 % if across). Its own file has the pose in another map, of the same place.
 _T_MAP_CAR_3 = se3.exp([30.598, 4.031, 0.055, -0.0016, -0.0118, 0.0095])

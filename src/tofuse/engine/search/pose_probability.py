@@ -47,8 +47,8 @@ IMAGES = ProbabilityModel(search=(0.34, 6.17, -6.40, -4.21), local=(0.55, 7.01, 
 _MUCH_CONTRADICTION, _FEW_SURFACES = 0.05, 50.0
 # Of searched poses: fitted to 446 of clouds, equal in weight by the square root of their number of
 # a kind (clips, views and scans of simulated flats; a dragon; lasers; cameras; random boxes;
-# symmetric bodies). Its log odds were then scaled by 1.78, less 0.40, as fitted to 145 poses of these
-# kinds, since some right poses of a laser had counted as wrong (docs/methods.md).
+# symmetric bodies), where right poses of a laser had counted as wrong. So its log odds were scaled by
+# 1.78, less 0.40: more cautiously than fits 145 corrected poses of these kinds (2.3, less 0.5).
 CLOUDS = ProbabilityModel(search=(-1.65, 17.7, -3.65, -11.9), local=(-2.29, 9.96, -5.5))
 
 
@@ -135,10 +135,12 @@ class PoseEvidence:
 
     @property
     def probability(self) -> float:
-        """Probability that the pose is right, 0 to 1."""
+        """Probability that the pose is right, 0 to `MAX_PROBABILITY`."""
         if self.margin is None:
-            return logistic(float(self.local_regressors @ self.model.local))
-        return logistic(float(self.search_regressors @ self.model.search))
+            log_odds = float(self.local_regressors @ self.model.local)
+        else:
+            log_odds = float(self.search_regressors @ self.model.search)
+        return min(logistic(log_odds), MAX_PROBABILITY)
 
     def rejection_reason(self) -> str:
         """Return the reason why the pose is rejected; empty if it is accepted."""
