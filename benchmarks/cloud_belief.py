@@ -10,7 +10,7 @@ import hashlib
 import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -213,6 +213,11 @@ def print_fit(data: Path, max_pairs: int) -> None:
         print(f"\ncoefficients in use {list(in_use)}:")
         families = dict.fromkeys(samples.family)
         print_outcomes({f: _outcomes(samples, np.array(in_use), f) for f in families})
+        log_odds = samples.x @ in_use
+        scaled = replace(samples, x=np.column_stack([np.ones_like(log_odds), log_odds]))
+        factors = np.round([scaled.fitted(f) for f in ("", *families)], 2).tolist()
+        print(f"\nconstant and factor that fit their log odds better: {factors[0]}; without")
+        print("; ".join(f"{f} {k}" for f, k in zip(families, factors[1:], strict=True)))
     print("\nnumber of surfaces that leads are reduced for, and log-likelihood of the left out")
     for few in _FEW:
         with mock.patch.object(pose_probability, "_FEW_SURFACES", few):

@@ -273,7 +273,7 @@ def test_evidence_of_clouds_is_lead_in_distinct_surfaces():
 
     right, few, walls, blind, contradicted, slides = cases = [
         evidence(25.0),
-        evidence(4.0, near=8.0),
+        evidence(2.0, near=8.0),
         evidence(1.0),
         evidence(25.0, free_space=False),
         evidence(25.0, contradiction=0.04),

@@ -380,7 +380,7 @@ class Locator:
                 evidence = pose_probability.PoseEvidence.of(
                     agreement, lead, len(placed.aligned.unobservable)
                 )
-                p = min(evidence.probability, pose_probability.MAX_PROBABILITY)
+                p = evidence.probability
                 ends = placed.T_map_camera, self._poses[k]
                 independence = self._independence(ends, counted, k)
                 total += independence * float(np.log(p / (1 - p)))

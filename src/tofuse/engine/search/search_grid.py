@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -76,7 +75,6 @@ class ResampledView:
         return kernels.Resampled(*points, self.grid, self.frame)
 
 
-@lru_cache(maxsize=4)
 def resampled(view: PreparedView) -> ResampledView:
     """Resample a view to a pinhole grid."""
     rays = view.rays[view.planes[..., 3] > 0]
