@@ -17,26 +17,26 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
 import cv2
 import numpy as np
-from phone import POSES_BY, features_of
 from scipy.ndimage import gaussian_filter
 
 import sequences
+from phone import POSES_BY, features_of
 from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.adaptation import with_prior
-from tofuse.engine.mapping.color_frames import ColorFrames
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import displacement
+from tofuse.engine.refinement import Joint
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab import scenes
@@ -50,7 +50,10 @@ NAMES = (
     "realsense_desk",
     "open3d_rgbd5",
 )
-COLOR, DEPTH = Pinhole(960, 720, 725.0, 725.0, 479.5, 359.5), Pinhole(256, 192, 193.3, 193.3, 127.5, 95.5)
+COLOR, DEPTH = (
+    Pinhole(960, 720, 725.0, 725.0, 479.5, 359.5),
+    Pinhole(256, 192, 193.3, 193.3, 127.5, 95.5),
+)
 FRAMES, RATE_HZ = 50, 10.0
 # Of the depth: blur (pixels), relative error, its width (pixels) and duration (frames).
 BLUR, DEPTH_ERROR, WIDTH, DURATION = 1.5, 0.007, 12.0, 10.0
@@ -77,7 +80,7 @@ def floor_path(speed: float) -> Path_:
     def path(t: float) -> Float64:
         yaw = 0.5 * np.sin(0.52 * speed * t)
         position = np.array([0.25 * t, 0.1 * np.sin(1.3 * t), 1.4 + 0.05 * np.sin(1.7 * t)])
-        return paths.look_at(position, position + [np.sin(yaw), np.cos(yaw), -1.3])
+        return paths.look_at(position, position + np.array([np.sin(yaw), np.cos(yaw), -1.3]))
 
     return path
 
@@ -85,7 +88,7 @@ def floor_path(speed: float) -> Path_:
 def scene_and_path(name: str, seed: int, speed: float) -> tuple[Scene, Path_]:
     """Return a scene and the path of the phone."""
     if name in ("floor", "plain"):
-        material = Material("floor", 0.4, 0.25, "speckle", (0.03, 0.03, 0.03))
+        material = Material("floor", 0.4, 0.25, "print", (0.2, 0.2, 0.2))
         material = material.uniform() if name == "plain" else material
         ground = mesh.quad((-10, -10, 0), (20, 0, 0), (0, 20, 0))
         return Scene(name, [material], ground, seed=seed), floor_path(speed)
@@ -159,24 +162,12 @@ def cast(
     return hits.distance.reshape(shape).astype(float), hits.albedo.reshape(shape).astype(float)
 
 
-@contextmanager
-def without_color() -> Iterator[None]:
-    """Leave the full resolution of colour unused."""
-    views = ColorFrames.views
-    ColorFrames.views = lambda self, graph, depths: []  # type: ignore[method-assign]
-    try:
-        yield
-    finally:
-        ColorFrames.views = views  # type: ignore[method-assign]
-
-
 def both(recording: Recording) -> Iterator[tuple[str, Reconstruction]]:
     """Yield the reconstructions without and with colour at full resolution."""
     prior = "auto" if POSES_BY in recording.metadata else "none"
     recording, config = with_prior(recording, from_method("default", "range"), prior)
-    with without_color():
-        yield "depth", reconstruct(recording, config)
-    yield "colour", reconstruct(recording, config)
+    for name, color in (("depth", False), ("colour", True)):
+        yield name, reconstruct(recording, replace(config, refinement=Joint(color=color)))
 
 
 def print_simulated(names: list[str], seeds: int, **options: float) -> None:
@@ -191,9 +182,7 @@ def print_simulated(names: list[str], seeds: int, **options: float) -> None:
                 assert recording.reference is not None
                 for method, result in both(recording):
                     posed = result.has_pose
-                    metres, rad = displacement(
-                        result.trajectory[posed], recording.reference[posed]
-                    )
+                    metres, rad = displacement(result.trajectory[posed], recording.reference[posed])
                     stated = result.diagnostics.accuracy
                     print(
                         f"| {name} {seed} | 1 of {every} | {method} | {posed.sum()} | "
@@ -212,7 +201,9 @@ def epipolar_matches(recording: Recording) -> list[tuple[int, int, Float64, Floa
     out = []
     matcher = cv2.BFMatcher()
     for a, b in combinations(list(features_of(recording)), 2):
-        back = {m.queryIdx: m.trainIdx for (m,) in matcher.knnMatch(b.descriptors, a.descriptors, 1)}
+        back = {
+            m.queryIdx: m.trainIdx for (m,) in matcher.knnMatch(b.descriptors, a.descriptors, 1)
+        }
         good = [
             m
             for m, second in matcher.knnMatch(a.descriptors, b.descriptors, 2)

@@ -19,7 +19,10 @@ from tofuse.engine.graph.levenberg import LevenbergMarquardt
 from tofuse.engine.mapping.color_frames import ColorFrames
 from tofuse.engine.mapping.reconstructing import reconstruct
 
-DEPTH, COLOR = Pinhole(128, 96, 120.0, 120.0, 63.5, 47.5), Pinhole(512, 384, 480.0, 480.0, 255.5, 191.5)
+DEPTH, COLOR = (
+    Pinhole(128, 96, 120.0, 120.0, 63.5, 47.5),
+    Pinhole(512, 384, 480.0, 480.0, 255.5, 191.5),
+)
 TEXEL_M = 0.004
 # One standard deviation of the edges by depth, m and rad: of a floor, x, y and yaw are open.
 OPEN, CLOSED = (0.03, 0.02), (0.002, 0.001)
@@ -48,7 +51,9 @@ def floor_view(
         places = np.moveaxis(frames[1][1][..., :2], 2, 0) / TEXEL_M + 500
         image = map_coordinates(floor, places, order=1, mode="wrap")
     image += rng.normal(0, 2, image.shape)
-    z = frames[0][0] * (1 + 0.003 * gaussian_filter(rng.standard_normal(frames[0][0].shape), 8) * 28)
+    z = frames[0][0] * (
+        1 + 0.003 * gaussian_filter(rng.standard_normal(frames[0][0].shape), 8) * 28
+    )
     color = np.repeat(image.clip(0, 255).astype(np.uint8)[..., None], 3, 2)
     return RangeFrame(k, 0.1 * k, DEPTH, z.astype(np.float32)), color
 
@@ -59,7 +64,9 @@ def walk(count: int = 8) -> Float64:
     for k in range(count):
         T = np.eye(4)
         T[:3, 3] = 0.08 * k, 0.03 * np.sin(k), 1.4
-        turn = se3.exp([0, 0, 0, 0.3 + 0.05 * np.sin(2 * k), 0.05 * np.cos(k), 0.12 * np.sin(k / 2)])
+        turn = se3.exp(
+            [0, 0, 0, 0.3 + 0.05 * np.sin(2 * k), 0.05 * np.cos(k), 0.12 * np.sin(k / 2)]
+        )
         poses.append(T @ DOWN @ turn)
     return np.stack(poses)
 

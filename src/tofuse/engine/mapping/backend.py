@@ -28,6 +28,7 @@ from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.tracked_graph import Optimised, Refined, TrackedGraph, VisualEvidence
 from tofuse.engine.progress import Progress
+from tofuse.engine.refinement import Joint
 from tofuse.engine.results import Component, Diagnostics, Reconstruction
 from tofuse.engine.stopwatch import current, timing
 
@@ -212,8 +213,9 @@ class BackEnd:
     @timing("colour")
     def _with_color(self, graph: PoseGraph) -> tuple[PoseGraph, tuple[Measured, ...]]:
         """Return the graph with the motions that colour images measure, and these edges."""
-        depths = self._observations.color_depths
-        if self._colors is None or not depths or not self._observations.has_covariances:
+        depths, refinement = self._observations.color_depths, self._config.refinement
+        wanted = isinstance(refinement, Joint) and refinement.color
+        if self._colors is None or not depths or not wanted:
             return graph, ()
         self._progress.stage("comparing colour images")
         return with_color(graph, self._colors.views(graph, depths), self._config.optimiser)
