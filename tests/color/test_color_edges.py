@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
-from tofuse.engine.color import ColorView, with_color
+from tofuse.engine.color import ColorView, measured_pairs, with_color
+from tofuse.engine.color.color_views import SEARCHES
 from tofuse.engine.compute import threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
@@ -123,6 +126,21 @@ def test_stated_covariance_shrinks_and_holds() -> None:
         e = floor_errors(refined.poses, truth)[1:]
         squared.append(np.einsum("ni,nij,nj->n", e, np.linalg.inv(C), e) / 6)
     assert 0.05 < np.mean(squared) < 2.5
+
+
+def test_shutter_that_rolls_is_in_the_covariance() -> None:
+    _, views, truth = scene(0)
+    moving = [replace(view, speed=(0.3, 0.5)) for view in views]
+    of_still, of_moving = (
+        [m.information for m in measured_pairs(v, truth, SEARCHES[1])] for v in (views, moving)
+    )
+    assert len(of_still) >= 7
+    for still, moved in zip(of_still, of_moving, strict=True):
+        sigma = np.sqrt(np.diag(np.linalg.inv(moved)) - np.diag(np.linalg.inv(still)))
+        # Both cameras of a pair move while their rows are read, within 20 ms.
+        assert sigma[3:] == pytest.approx(np.sqrt(2) * 0.5 * 0.02 / np.sqrt(12), rel=0.1)
+        # Rotations move the other camera, too.
+        assert sigma[:3] == pytest.approx(np.sqrt(2) * 0.3 * 0.02 / np.sqrt(12), rel=0.2)
 
 
 def test_noise_without_texture_measures_nothing() -> None:

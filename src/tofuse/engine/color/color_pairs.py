@@ -33,6 +33,9 @@ _BETTER, _BY_CHANCE = 0.95, 1e-6
 _MEDIAN_2, _MEDIAN_6, _LIMIT = 1.386, 5.348, 18.0
 _ITERATIONS, _CONVERGED = 30, 1e-2  # in `UNITS`
 _WEAK = 1e-3  # information of a weak prior in `UNITS`
+# Standard deviation of the times of a rolling shutter's rows, which usually takes up to 20 ms; the
+# times of colour and depth differ by no more.
+_SHUTTER_S = 0.006
 _MIN_PIXELS = 0.05  # standard deviation of matches: no interpolation is better
 
 
@@ -50,9 +53,9 @@ def measured_pairs(
 ) -> tuple[Measured, ...]:
     """Measure the motions between views that show the same patches.
 
-    The information of a pair is that of its reprojections, whose errors are estimated from them,
-    reduced by the disagreement along triangles of pairs and, as all pairs of a view share its
-    errors, by their number.
+    The errors of a pair are those of its reprojections, estimated from them and from the triangles
+    of pairs, and the motion of its cameras while their shutters roll. As all pairs of a view share
+    its errors, the information is divided by their number.
 
     Parameters
     ----------
@@ -86,10 +89,13 @@ def measured_pairs(
     if not len(pairs):
         return ()
     T, information = (np.stack(column) for column in zip(*filter(None, fits), strict=True))
+    C = np.linalg.inv(information + np.diag(_WEAK / projective.UNITS**2))
+    variance = (_SHUTTER_S * np.array([view.speed for view in views])) ** 2
+    C *= _disagreement(pairs, T, C)
     partners = np.bincount(pairs.ravel(), minlength=len(views))
-    information /= (
-        0.5 * partners[pairs].sum(1)[:, None, None] * _disagreement(pairs, T, information)
-    )
+    C *= 0.5 * partners[pairs].sum(1)[:, None, None]
+    C += np.repeat(variance[pairs].sum(1), 3, 1)[:, :, None] * np.eye(6)
+    information = np.linalg.inv(C)
     return tuple(
         Measured(views[j].index, views[i].index, T_j_i, H)
         for (i, j), T_j_i, H in zip(pairs, *_reversed(T, information), strict=True)
@@ -223,11 +229,9 @@ def _reversed(T_i_j: Float64, information: Float64) -> tuple[Float64, Float64]:
     return se3.inverse(T_i_j), np.swapaxes(A, 1, 2) @ information @ A
 
 
-def _disagreement(pairs: Intp, T: Float64, information: Float64) -> float:
+def _disagreement(pairs: Intp, T: Float64, C: Float64) -> float:
     """Return the factor of the variances, 1 or more, by which triangles of pairs close."""
     row = {(int(i), int(j)): k for k, (i, j) in enumerate(pairs)}
-    weak = np.diag(_WEAK / projective.UNITS**2)
-    C = np.linalg.inv(information + weak)
     found = []
     for (i, j), ij in row.items():
         for k in range(j + 1, int(pairs.max()) + 1):
@@ -235,9 +239,8 @@ def _disagreement(pairs: Intp, T: Float64, information: Float64) -> float:
             if jk is None or ik is None:
                 continue
             T_k_j = se3.inverse(T[jk])
-            A, B = se3.adjoint(T_k_j), se3.adjoint(se3.inverse(T[ik]) @ T[ij] @ T[jk])
+            A = se3.adjoint(T_k_j)
             error = se3.log(se3.inverse(T[ik]) @ T[ij] @ T[jk])
-            # To first order the closure is the identity, and B too.
-            total = A @ C[ij] @ A.T + C[jk] + B @ C[ik] @ B.T
+            total = A @ C[ij] @ A.T + C[jk] + C[ik]
             found.append(float(error @ np.linalg.solve(total, error)))
     return max(1.0, float(np.median(found)) / _MEDIAN_6) if found else 1.0

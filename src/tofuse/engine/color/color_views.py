@@ -61,6 +61,8 @@ class ColorView:
     inverse_depth, slope, sigma
         (N,) 1/m, (N, 2) its slopes by the ray coordinates, (N,) standard deviation about the plane:
         large at edges.
+    speed
+        Of the camera, m/s and rad/s.
     """
 
     index: int
@@ -71,9 +73,12 @@ class ColorView:
     inverse_depth: Float64
     slope: Float64
     sigma: Float64
+    speed: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def of(cls, frame: RangeFrame, color: UInt8) -> ColorView:
+    def of(
+        cls, frame: RangeFrame, color: UInt8, speed: tuple[float, float] = (0.0, 0.0)
+    ) -> ColorView:
         """Select the patches of a frame with colour (H, W, 3) of any resolution."""
         camera = frame.camera
         image = np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), np.uint8)
@@ -107,7 +112,7 @@ class ColorView:
         kept &= np.isfinite(rays).all(1)
         return cls(
             frame.index, camera, image, pixels[kept], rays[kept],
-            plane[kept, 2, 0], plane[kept, :2, 0], sigma[kept],
+            plane[kept, 2, 0], plane[kept, :2, 0], sigma[kept], speed,
         )  # fmt: skip
 
     @cached_property

@@ -12,6 +12,7 @@ from tofuse.engine.arrays import UInt8
 from tofuse.engine.color import ColorView
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, Recording, Source
+from tofuse.engine.geometry import se3
 from tofuse.engine.graph import PoseGraph
 from tofuse.engine.sensor import Corrector
 from tofuse.engine.stored_views import Spacing, ViewStore
@@ -19,6 +20,7 @@ from tofuse.engine.stored_views import Spacing, ViewStore
 # Wider than for depth: colour constrains far pairs, and frames in between follow by depth.
 _SPACING = Spacing(angle=0.08, distance=0.05, max_views=60)
 _MOST_PIXELS = 1_000_000
+_USUAL_RATE_HZ = 30.0
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class ColorFrames:
         for index, pose in zip(graph.ids.tolist(), graph.poses, strict=True):
             if depths.get(index, 0.0) > 0:
                 store.push(_Frame(index, depths[index]), pose)
+        speeds = self._speeds(graph)
         views = []
         for item in store.views:
             frame = self.recording.source.read(item.index)
@@ -63,8 +66,21 @@ class ColorFrames:
                 frame = corrector.apply(frame)
             assert color is not None
             assert isinstance(frame, RangeFrame)
-            views.append(ColorView.of(frame, color))
+            views.append(ColorView.of(frame, color, speeds[item.index]))
         return views
+
+    def _speeds(self, graph: PoseGraph) -> dict[int, tuple[float, float]]:
+        """Return the speeds of the camera, m/s and rad/s, by frame index."""
+        times = self.recording.source.timestamps[graph.ids]
+        if not self.recording.has_timestamps:
+            times = times / _USUAL_RATE_HZ
+        steps = np.abs(se3.log(se3.inverse(graph.poses[:-1]) @ graph.poses[1:])).reshape(-1, 2, 3)
+        rates = np.linalg.norm(steps, axis=2) / np.maximum(np.diff(times), 1e-3)[:, None]
+        rates = np.concatenate([rates[:1], rates, rates[-1:], np.zeros((2, 2))])[: len(times) + 1]
+        around = np.maximum(rates[:-1], rates[1:])
+        return {
+            int(k): (float(m), float(rad)) for k, (m, rad) in zip(graph.ids, around, strict=True)
+        }
 
 
 def full_image(recording: Recording, frame: RangeFrame, most_pixels: int) -> UInt8 | None:
