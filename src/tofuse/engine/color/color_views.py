@@ -153,7 +153,8 @@ class ColorView:
 
     def shows(self, pixels: Float64) -> Float64:
         """Return 1.0 for each of the pixels (M, 2) inside the image, else 0.0."""
-        return ((pixels >= 0) & (pixels < self.image.shape[::-1])).all(1).astype(np.float64)
+        inside = (pixels >= 0) & (pixels < self.image.shape[::-1])
+        return np.asarray(inside.all(1), np.float64)
 
     @property
     def _zoom(self) -> float:
