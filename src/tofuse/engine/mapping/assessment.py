@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.color import with_edges
 from tofuse.engine.frames import RangeFrame, frame_ranges
 from tofuse.engine.fusion import Model, with_pose_errors
 from tofuse.engine.graph import LoopRecord, PoseGraph, external_sensors, graph_covariances
@@ -24,7 +25,6 @@ from tofuse.engine.quality import (
     pose_accuracy,
     trajectory_errors,
 )
-from tofuse.engine.refinement import Refinement
 from tofuse.engine.results import Component, FrameRecord, Reason, Verdict, checks, verdicts
 from tofuse.engine.sensor import CameraErrors
 from tofuse.engine.tracking import FrameTime, given, moving_objects
@@ -185,7 +185,7 @@ class Assessment:
         observed = self._observed_errors(closed, refined, cross_view)
 
         claimed = self._by_images(closed, refined)
-        measured = self._measured(claimed, refined.refinement).with_poses(refined.graph.poses)
+        measured = self._measured(claimed, refined).with_poses(refined.graph.poses)
 
         def assessed(
             sensors: external_sensors.SensorPriors, observed: pose_accuracy.ObservedErrors
@@ -228,9 +228,10 @@ class Assessment:
         """Return the final graph without external sensors."""
         if not closed.sensors:
             return refined.graph
-        if not refined.refinement.kept:
-            return closed.visual.optimisation.graph
-        return self.tracked.build(closed.loops, refined.refinement, confirmed=closed.confirmed)
+        graph, refinement = closed.visual.optimisation.graph, refined.refinement
+        if refinement.kept:
+            graph = self.tracked.build(closed.loops, refinement, confirmed=closed.confirmed)
+        return with_edges(graph, refined.color)
 
     def _observed_errors(
         self,
@@ -254,8 +255,10 @@ class Assessment:
             *shift, excess_m, *calibration, *split, corrected=bool(corrections)
         )
 
-    def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:
-        return self.tracked.measured(graph, self.observations.views, refinement.non_overlap_edges)
+    def _measured(self, graph: PoseGraph, refined: Refined) -> PoseGraph:
+        color = [(m.i, m.j) for m in refined.color]
+        edges = (*refined.refinement.non_overlap_edges, *color)
+        return self.tracked.measured(graph, self.observations.views, edges)
 
     @property
     def _estimated_corrections(self) -> list[CameraErrors]:

@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tofuse.engine.arrays import Float64
+from tofuse.engine.color import with_color
 from tofuse.engine.compute import trim_memory
 from tofuse.engine.fusion import Cloud, Model
 from tofuse.engine.graph import (
     LoopRecord,
+    Measured,
     Optimisation,
     PoseGraph,
     certificate,
@@ -20,11 +22,13 @@ from tofuse.engine.graph import (
 )
 from tofuse.engine.loops import ClosedLoop, Join, PriorLoop, degraded_neighbours
 from tofuse.engine.mapping.assessment import Assessment
+from tofuse.engine.mapping.color_frames import ColorFrames
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.tracked_graph import Optimised, Refined, TrackedGraph, VisualEvidence
 from tofuse.engine.progress import Progress
+from tofuse.engine.refinement import Joint
 from tofuse.engine.results import Component, Diagnostics, Reconstruction
 from tofuse.engine.stopwatch import current, timing
 
@@ -48,12 +52,15 @@ class Job:
         Given loops.
     progress
         Receives stages.
+    colors
+        Colour at its full resolution, if it is to be used.
     """
 
     config: Config
     observations: Observations
     prior_loops: Sequence[PriorLoop]
     progress: Progress
+    colors: ColorFrames | None = None
 
 
 class BackEnd:
@@ -76,6 +83,7 @@ class BackEnd:
     ) -> None:
         self._config, self._log, self._prior_loops = job.config, log, job.prior_loops
         self._observations, self._progress = job.observations, job.progress
+        self._colors = job.colors
         posed = [e for e in log.posed if e.record.index in poses]
         self._tracked = TrackedGraph(posed, poses, joins)
 
@@ -199,7 +207,18 @@ class BackEnd:
             graph = external_sensors.with_sensors(graph, sensors)
             if sensors.steps:
                 graph = self._config.optimiser.optimise(graph).graph
-        return closed, Refined(graph, refinement)
+        graph, edges = self._with_color(graph)
+        return closed, Refined(graph, refinement, edges)
+
+    @timing("colour")
+    def _with_color(self, graph: PoseGraph) -> tuple[PoseGraph, tuple[Measured, ...]]:
+        """Return the graph with the motions that colour images measure, and these edges."""
+        depths, refinement = self._observations.color_depths, self._config.refinement
+        wanted = isinstance(refinement, Joint) and refinement.color
+        if self._colors is None or not depths or not wanted:
+            return graph, ()
+        self._progress.stage("comparing colour images")
+        return with_color(graph, self._colors.views(graph, depths), self._config.optimiser)
 
     def _measured(
         self, graph: PoseGraph, non_overlap_edges: Sequence[tuple[int, int]] = ()
@@ -212,7 +231,7 @@ class BackEnd:
     def _fuse(self, closed: Optimised, refined: Refined) -> tuple[Model, Cloud | None]:
         """Return the model, and a cloud at the poses before optimisation if that changed any."""
         graph, refinement, model = refined.graph, refined.refinement, self._observations.model
-        poses_changed = bool(graph.loop.any()) or refinement.kept or bool(closed.sensors)
+        poses_changed = bool(graph.loop.any() or refinement.kept or closed.sensors or refined.color)
         self._progress.stage("fusing", model.views)
         ids = graph.ids.tolist()
         fused = model.fuse(

@@ -17,6 +17,7 @@ from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping import adaptation
 from tofuse.engine.mapping.assembly import Assembly
 from tofuse.engine.mapping.backend import Job
+from tofuse.engine.mapping.color_frames import ColorFrames
 from tofuse.engine.mapping.config import Config, check_views, kind_of
 from tofuse.engine.mapping.frame_log import FrameLog, FrameSequence, record_of
 from tofuse.engine.mapping.live_poses import LivePoses
@@ -68,6 +69,7 @@ class Mapper:
         progress: Progress | None = None,
         tracker: Tracker | None = None,
         surface: bool = True,
+        colors: ColorFrames | None = None,
     ) -> None:
         check_number(seed, Bounds(0), "seed", whole=True)
         self.config = from_method(config) if isinstance(config, str) else config
@@ -81,7 +83,7 @@ class Mapper:
         self._log = FrameLog()
         self._finished = False
         self._shift: Float64 = np.zeros(3)
-        self._given_tracker = tracker
+        self._given_tracker, self._colors = tracker, colors
         self._start_method()
         self._progress.began(self.so_far)
 
@@ -286,7 +288,9 @@ class Mapper:
                 e.T_odometry is not None for e in self._log.entries
             ):
                 self.config = adaptation.with_odometry_prior(self.config)
-            job = Job(self.config, self._observations, self._prior_loops, self._progress)
+            job = Job(
+                self.config, self._observations, self._prior_loops, self._progress, self._colors
+            )
             result = Assembly(job, self.seed, self.threads).run(self._log)
         diagnostics = replace(
             result.diagnostics,

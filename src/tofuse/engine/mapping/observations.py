@@ -47,6 +47,8 @@ class Observations:
         Stored views of the model.
     depths
         Typical radial range of each posed frame, m, by index.
+    color_depths
+        Those of the frames with registered colour.
     ambiguity_m
         Ambiguity range of the camera, if known.
     samples
@@ -69,6 +71,7 @@ class Observations:
         self._checks = frame_samples.EvenSample[Spilled[RangeFrame]](_CHECKED_IMAGES)
         self._checks_spill: Spill[RangeFrame] = Spill(checked_bytes(config.memory_mb))
         self.depths: dict[int, float] = {}
+        self.color_depths: dict[int, float] = {}
         self.ambiguity_m: float | None = None
         self._needs_points = self.loops.needs_points or self.refiner.needs_points
         self._queue = _BackgroundQueue()
@@ -115,6 +118,8 @@ class Observations:
         depth = _typical_range(frame)
         if isinstance(frame, RangeFrame):
             self.depths[frame.index] = depth
+            if frame.color_image is not None and frame.color_registered:
+                self.color_depths[frame.index] = depth
             if isinstance(clean, RangeFrame):
                 self._checks.offer(
                     lambda: Spilled(

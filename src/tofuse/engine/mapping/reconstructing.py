@@ -16,6 +16,7 @@ from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import POSES_BY, Frame, Recording
 from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping.adaptation import adapted
+from tofuse.engine.mapping.color_frames import ColorFrames
 from tofuse.engine.mapping.config import Config, ViewKind, kind_of
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.mapper import Mapper
@@ -23,6 +24,7 @@ from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.self_calibration import self_calibrated
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction
+from tofuse.engine.sensor import CameraErrors
 from tofuse.engine.stopwatch import current, timing
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.tracking import Tracker
@@ -140,6 +142,7 @@ def _track(
         progress=progress,
         tracker=tracker,
         surface=surface,
+        colors=ColorFrames(recording, CameraErrors.made_with(config.to_dict())),
     )
     with mapper.watch.running(), timing("reading"):
         unreadable = push_frames(mapper, recording, config.window)

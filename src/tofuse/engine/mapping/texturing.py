@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.engine.arrays import Bool, UInt8
+from tofuse.engine.arrays import Bool
 from tofuse.engine.compute import threads as use_threads
-from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.engine.frames import RangeFrame, Recording, Source, evenly_spaced
+from tofuse.engine.errors import UnreadableFrameError
+from tofuse.engine.frames import RangeFrame, Recording, evenly_spaced
 from tofuse.engine.fusion import display_surface, texture
 from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.color_frames import full_image, origin_of
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.sensor import CameraErrors
@@ -102,39 +102,13 @@ def make_texture(
 
 def _colored(recording: Recording) -> Bool:
     """Return which frames (M,) may have colour: phones record it less often than depth."""
-    origins = (_origin(recording.source, k) for k in recording.indices.tolist())
+    origins = (origin_of(recording.source, k) for k in recording.indices.tolist())
     return np.array([getattr(s, "has_color", lambda _: True)(k) for s, k in origins], bool)
 
 
 def _has_color(recording: Recording, k: int) -> bool:
     frame = recording.image(k)
     return frame is not None and frame.color_image is not None
-
-
-def _origin(source: Source, index: int) -> tuple[Source, int]:
-    """Return the source and the index there of a frame of a source made of others."""
-    while (origin := getattr(source, "origin", None)) is not None:
-        source, index = origin(index)
-    return source, index
-
-
-def full_image(recording: Recording, frame: RangeFrame, most_pixels: int) -> UInt8 | None:
-    """Return the colour of a frame as recorded, if it is finer than that at the depth's size."""
-    source, index = _origin(recording.source, frame.index)
-    read = getattr(source, "full_resolution_color", None)
-    if read is None or frame.color_image is None:
-        return None
-    try:
-        image: UInt8 | None = read(index)
-    except InputError:
-        return None
-    if image is None or len(image) <= len(frame.color_image):
-        return None
-    step = int(np.ceil(np.sqrt(image.shape[0] * image.shape[1] / max(most_pixels, 1))))
-    if step == 1:
-        return image
-    size = (image.shape[1] // step, image.shape[0] // step)
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def steadiest_frames(result: Reconstruction, usable: Bool | None = None) -> list[int]:

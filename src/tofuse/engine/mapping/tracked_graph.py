@@ -223,7 +223,8 @@ class Optimised:
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """The result of refining all views."""
+    """The result of refining all views, with the edges of the graph that colour images measure."""
 
     graph: PoseGraph
     refinement: Refinement
+    color: tuple[Measured, ...] = ()

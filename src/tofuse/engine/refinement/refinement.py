@@ -209,11 +209,14 @@ class Joint(Bounded, RefinementMethod):
         Maximum number of earlier views that each one is compared with; fewer for speed.
     submap
         Largest number of views that are refined together; more are divided, see `submaps`.
+    color
+        Whether motions that colour images measure at their full resolution are added, see `color`.
     """
 
     calibrate: tuple[CameraError, ...] = ()
     neighbours: Annotated[int, Bounds(1)] = 10
     submap: Annotated[int, Bounds(10, 100_000)] = 300
+    color: bool = True
 
     @property
     def alignment(self) -> pair_equations.RefineOptions:
