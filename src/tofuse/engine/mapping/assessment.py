@@ -25,6 +25,7 @@ from tofuse.engine.quality import (
     pose_accuracy,
     trajectory_errors,
 )
+from tofuse.engine.refinement import Refinement
 from tofuse.engine.results import Component, FrameRecord, Reason, Verdict, checks, verdicts
 from tofuse.engine.sensor import CameraErrors
 from tofuse.engine.tracking import FrameTime, given, moving_objects
@@ -184,13 +185,13 @@ class Assessment:
             ).of_poses
         observed = self._observed_errors(closed, refined, cross_view)
 
-        claimed = self._by_images(closed, refined)
-        measured = self._measured(claimed, refined).with_poses(refined.graph.poses)
+        claimed = self._by_depth(closed, refined)
+        measured = self._measured(claimed, refined.refinement).with_poses(refined.graph.poses)
 
         def assessed(
             sensors: external_sensors.SensorPriors, observed: pose_accuracy.ObservedErrors
         ) -> tuple[pose_accuracy.Accuracy, graph_covariances.GraphCovariances]:
-            graph = external_sensors.with_sensors(measured, sensors)
+            graph = with_edges(external_sensors.with_sensors(measured, sensors), refined.color)
             covariances = graph_covariances.GraphCovariances(graph)
             bounds = pose_accuracy.accuracy_of(covariances, observed, model.cloud.diagonal_m)
             return bounds, covariances
@@ -200,7 +201,8 @@ class Assessment:
         by_images = accuracy
         together = closed.sensors.verified and closed.sensors.is_continuous
         if together:
-            scale = pose_accuracy.scale_of_registrations(covariances, observed)
+            by_depth = graph_covariances.GraphCovariances(measured)
+            scale = pose_accuracy.scale_of_registrations(by_depth, observed)
             sensors = closed.sensors.with_depth_scale_of(scale)
             observed = observed.of_other_sensors()
             accuracy, covariances = assessed(sensors, observed)
@@ -224,14 +226,13 @@ class Assessment:
             covariances = assessed(sensors, observed)[1]
         return accuracy, pose_accuracy.covariances_of(covariances, observed)
 
-    def _by_images(self, closed: Optimised, refined: Refined) -> PoseGraph:
-        """Return the final graph without external sensors."""
-        if not closed.sensors:
+    def _by_depth(self, closed: Optimised, refined: Refined) -> PoseGraph:
+        """Return the final graph without colour and external sensors."""
+        if not closed.sensors and not refined.color:
             return refined.graph
-        graph, refinement = closed.visual.optimisation.graph, refined.refinement
-        if refinement.kept:
-            graph = self.tracked.build(closed.loops, refinement, confirmed=closed.confirmed)
-        return with_edges(graph, refined.color)
+        if not refined.refinement.kept:
+            return closed.visual.optimisation.graph
+        return self.tracked.build(closed.loops, refined.refinement, confirmed=closed.confirmed)
 
     def _observed_errors(
         self,
@@ -255,10 +256,8 @@ class Assessment:
             *shift, excess_m, *calibration, *split, corrected=bool(corrections)
         )
 
-    def _measured(self, graph: PoseGraph, refined: Refined) -> PoseGraph:
-        color = [(m.i, m.j) for m in refined.color]
-        edges = (*refined.refinement.non_overlap_edges, *color)
-        return self.tracked.measured(graph, self.observations.views, edges)
+    def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:
+        return self.tracked.measured(graph, self.observations.views, refinement.non_overlap_edges)
 
     @property
     def _estimated_corrections(self) -> list[CameraErrors]:

@@ -58,7 +58,10 @@ class ColorFrames:
         speeds = self._speeds(graph)
         views = []
         for item in store.views:
-            frame = self.recording.source.read(item.index)
+            try:
+                frame = self.recording.source.read(item.index)
+            except InputError:  # no longer readable
+                continue
             assert isinstance(frame, RangeFrame)
             full = full_image(self.recording, frame, _MOST_PIXELS)
             color = frame.color_image if full is None else full
