@@ -221,7 +221,7 @@ def test_every_part_is_listed_with_all_of_its_options(cls: Any) -> None:
 def test_default_configuration_has_few_options(kind: ViewKind) -> None:
     """What users have no reason to set should be a constant."""
     options = list(reference.options_of(from_method("default", kind)))
-    assert 40 < len(options) <= 61
+    assert 40 < len(options) <= 62
     assert all(option.text for option in options)
 
 

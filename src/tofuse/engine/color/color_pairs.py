@@ -36,6 +36,8 @@ _WEAK = 1e-3  # information of a weak prior in `UNITS`
 # Standard deviation of the times of a rolling shutter's rows, which usually takes up to 20 ms; the
 # times of colour and depth differ by no more.
 _SHUTTER_S = 0.006
+# Relative error of the depth that all patches share, as makers specify, and so of translations.
+_DEPTH_SCALE = 0.01
 _MIN_PIXELS = 0.05  # standard deviation of matches: no interpolation is better
 
 
@@ -54,7 +56,8 @@ def measured_pairs(
     """Measure the motions between views that show the same patches.
 
     The errors of a pair are those of its reprojections, estimated from them and from the triangles
-    of pairs, and the motion of its cameras while their shutters roll. As all pairs of a view share
+    of pairs, that of the scale of the depth, and the motion of its cameras while their shutters
+    roll. As all pairs of a view share
     its errors, the information is divided by their number.
 
     Parameters
@@ -92,6 +95,8 @@ def measured_pairs(
     C = np.linalg.inv(information + np.diag(_WEAK / projective.UNITS**2))
     variance = (_SHUTTER_S * np.array([view.speed for view in views])) ** 2
     C *= _disagreement(pairs, T, C)
+    shared = (np.swapaxes(T[:, :3, :3], 1, 2) @ T[:, :3, 3:])[..., 0] * _DEPTH_SCALE
+    C[:, :3, :3] += shared[:, :, None] * shared[:, None]
     partners = np.bincount(pairs.ravel(), minlength=len(views))
     C *= 0.5 * partners[pairs].sum(1)[:, None, None]
     C += np.repeat(variance[pairs].sum(1), 3, 1)[:, :, None] * np.eye(6)
