@@ -259,16 +259,17 @@ def drifting(
 # ---- Rows ----------------------------------------------------------------------------------------
 
 
-def methods(recording: Recording) -> Iterator[tuple[str, Float64]]:
-    """Yield the poses of each method."""
+def methods(recording: Recording) -> Iterator[tuple[str, Float64, float]]:
+    """Yield the poses of each method, and the stated bound on their errors (m), NaN without."""
     if recording.reference is not None:
-        yield "phone alone", recording.reference
+        yield "phone alone", recording.reference, np.nan
     priors: dict[str, Prior] = {"depth alone": "none", "both": "auto"}
     for name, prior in priors.items():
         if prior == "auto" and recording.reference is None:
             continue
         source, config = with_prior(recording, from_method("default", "range"), prior)
-        yield name, reconstruct(source, config).trajectory
+        result = reconstruct(source, config)
+        yield name, result.trajectory, result.diagnostics.accuracy.position_m
 
 
 def recorded(data: Path, names: list[str]) -> None:
@@ -281,7 +282,7 @@ def recorded(data: Path, names: list[str]) -> None:
             continue
         recording = open_recording(data / name)
         measured = color_rotations(recording)
-        for method, poses in methods(recording):
+        for method, poses, _ in methods(recording):
             angles = np.degrees(rotation_errors(poses, measured))
             rotation = "-"
             if len(angles):
@@ -296,20 +297,24 @@ def recorded(data: Path, names: list[str]) -> None:
 
 def simulated(scenes: list[str], seeds: int) -> None:
     """Print the table of simulated phones."""
-    print("| scene | drift | poses | position rms, mm | rotation rms, deg | map rms, mm |")
-    print("|---|---|---|---|---|---|")
+    print("| scene | drift | poses | position rms, mm | rotation rms, deg | map rms, mm | ", end="")
+    print("stated, mm | inside |")
+    print("|---|---|---|---|---|---|---|---|")
     for scene in scenes:
         for title, drift in DRIFTS.items():
-            errors: dict[str, list[tuple[float, float, float]]] = {}
+            errors: dict[str, list[tuple[float, float, float, float]]] = {}
             for seed in range(seeds):
                 recording, truth = simulated_phone(scene, seed, drift)
-                for method, poses in methods(recording):
-                    errors.setdefault(method, []).append(_errors(recording, poses, truth))
-            for method, found in errors.items():
-                position, rotation, rms = np.sqrt((np.array(found) ** 2).mean(0))
+                for method, poses, bound in methods(recording):
+                    found = (*_errors(recording, poses, truth), bound)
+                    errors.setdefault(method, []).append(found)
+            for method, rows in errors.items():
+                position, rotation, rms, stated = np.sqrt((np.array(rows) ** 2).mean(0))
+                inside = sum(error <= bound for error, _, _, bound in rows)
                 print(
                     f"| {scene} | {title} | {method} | {1000 * position:.1f} | "
-                    f"{np.degrees(rotation):.2f} | {1000 * rms:.1f} |",
+                    f"{np.degrees(rotation):.2f} | {1000 * rms:.1f} | {1000 * stated:.1f} | "
+                    f"{inside} of {len(rows)} |",
                     flush=True,
                 )
 
