@@ -139,9 +139,9 @@ class SensorPriors:
         """Whether no step of odometry was rejected, as where a device relocalizes."""
         return all(r.used == r.measured for r in self.records if r.sensor == "odometry")
 
-    def with_depth_scale_of(self, at_least: tuple[float, float]) -> SensorPriors:
-        """Return the measurements with factors on the sigmas of registrations of at least these."""
-        translation, rotation = np.maximum(self.depth_scale, at_least).tolist()
+    def with_depth_scale_at_least(self, least: tuple[float, float]) -> SensorPriors:
+        """Return the measurements with a `depth_scale` of at least this."""
+        translation, rotation = np.maximum(self.depth_scale, least).tolist()
         return replace(self, depth_scale=(translation, rotation))
 
     def gravity_of(self, ids: Sequence[int]) -> Gravity | None:

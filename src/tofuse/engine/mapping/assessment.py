@@ -201,9 +201,11 @@ class Assessment:
         by_images = accuracy
         together = closed.sensors.verified and closed.sensors.is_continuous
         if together:
-            by_depth = graph_covariances.GraphCovariances(measured)
+            by_depth = covariances
+            if refined.color:
+                by_depth = graph_covariances.GraphCovariances(measured)
             scale = pose_accuracy.scale_of_registrations(by_depth, observed)
-            sensors = closed.sensors.with_depth_scale_of(scale)
+            sensors = closed.sensors.with_depth_scale_at_least(scale)
             observed = observed.of_other_sensors()
             accuracy, covariances = assessed(sensors, observed)
         elif closed.sensors.verified and accuracy.unbounded:

@@ -57,6 +57,9 @@ class Mapper:
         Replaces that of the configuration's odometry.
     surface
         Whether images make a surface; otherwise the model is a sketch, for judging poses alone.
+    colors
+        Reads the colour of pushed frames again, at its full resolution, so that `finish` can
+        measure motions by it; None: colour counts at the size of the depth only.
     """
 
     def __init__(
