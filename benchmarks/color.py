@@ -18,21 +18,20 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 import sequences
-from phone import POSES_BY, features_of
-from tofuse.engine.arrays import Float64, UInt8
-from tofuse.engine.cameras import Pinhole
-from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import ArraySource, Recording
+from phone import features_of, opened
+from tofuse.engine.arrays import Float64
+from tofuse.engine.cameras import scaled
+from tofuse.engine.frames.recording import POSES_BY, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.adaptation import with_prior
+from tofuse.engine.mapping.adaptation import Prior, with_prior
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import displacement
@@ -40,8 +39,9 @@ from tofuse.engine.refinement import Joint
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab import scenes
+from tofuse.lab.simulation.phone import COLOR, PhoneErrors, PhonePlan
 from tofuse.lab.world import Material, mesh, paths
-from tofuse.lab.world.scene import Scene
+from tofuse.lab.world.scene import Scene, Sequence
 
 NAMES = (
     "iphone_chair_3dscannerapp",
@@ -50,28 +50,12 @@ NAMES = (
     "realsense_desk",
     "open3d_rgbd5",
 )
-COLOR, DEPTH = (
-    Pinhole(960, 720, 725.0, 725.0, 479.5, 359.5),
-    Pinhole(256, 192, 193.3, 193.3, 127.5, 95.5),
-)
+SIZE = scaled(COLOR, 960, 720)
 FRAMES, RATE_HZ = 50, 10.0
-# Of the depth: blur (pixels), relative error, its width (pixels) and duration (frames).
-BLUR, DEPTH_ERROR, WIDTH, DURATION = 1.5, 0.007, 12.0, 10.0
-NOISE = 2.0  # levels of the colour
 READOUT_S = 0.02
 MATCH_PIXELS, MIN_MATCHES = 2.0, 60
 
 Path_ = Callable[[float], Float64]
-
-
-class PhoneSource(ArraySource):
-    """Frames with colour at a higher resolution than depth."""
-
-    images: list[UInt8 | None]
-
-    def full_resolution_color(self, index: int) -> UInt8 | None:
-        """Return the colour (H, W, 3) of a frame as recorded."""
-        return self.images[index]
 
 
 def floor_path(speed: float) -> Path_:
@@ -98,8 +82,8 @@ def scene_and_path(name: str, seed: int, speed: float) -> tuple[Scene, Path_]:
 
 def simulated(
     name: str, seed: int, *, every: int = 1, readout_s: float = 0.0, speed: float = 1.0
-) -> tuple[Recording, Float64]:
-    """Simulate a phone; return the recording and the true poses.
+) -> PhonePlan:
+    """Plan a recording of a phone.
 
     Parameters
     ----------
@@ -113,84 +97,38 @@ def simulated(
         Factor on that of the path.
     """
     scene, path = scene_and_path(name, seed, speed)
-    rng = np.random.default_rng([seed, 7])
-    frames, images, error = [], [], np.zeros((DEPTH.height, DEPTH.width))
-    for k in range(FRAMES):
-        field = gaussian_filter(rng.standard_normal(error.shape), WIDTH, mode="reflect")
-        kept = float(np.exp(-1 / DURATION)) if k else 0.0
-        error = kept * error + np.sqrt(1 - kept**2) * DEPTH_ERROR / field.std() * field
-        distance, _ = cast(scene, DEPTH, path, k / RATE_HZ, 0.0)
-        z = distance / np.linalg.norm(homogeneous(DEPTH), axis=2)
-        z = np.where(np.isfinite(z), z, 0.0)
-        z = gaussian_filter(z, BLUR) * (1 + error)
-        color = None
-        if k % every == 0:
-            _, albedo = cast(scene, COLOR, path, k / RATE_HZ, readout_s)
-            level = 30 + 200 * gaussian_filter(albedo, 0.6) + rng.normal(0, NOISE, albedo.shape)
-            color = np.repeat(level.clip(0, 255).astype(np.uint8)[..., None], 3, 2)
-        small = None
-        if color is not None:
-            small = cv2.resize(color, (DEPTH.width, DEPTH.height), interpolation=cv2.INTER_AREA)
-        depth = np.round(z, 3).astype(np.float32)
-        frames.append(RangeFrame(k, k / RATE_HZ, DEPTH, depth, color_image=small))
-        images.append(color)
-    poses = np.stack([path(k / RATE_HZ) for k in range(FRAMES)])
-    truth = se3.inverse(poses[0]) @ poses
-    source = PhoneSource(frames)
-    source.images = images
-    return Recording.of(source, f"simulated {name}", "simulated"), truth
+    times = np.arange(FRAMES) / RATE_HZ
+    errors = PhoneErrors(shutter=readout_s)
+    motion = Sequence(FRAMES, 1, RATE_HZ, path)
+    return PhonePlan(scene, motion, times, errors, seed, color=SIZE, color_every=every)
 
 
-def homogeneous(camera: Pinhole) -> Float64:
-    """(H, W, 3) rays at z = 1."""
-    rays = camera.rays().astype(float)
-    return np.concatenate([rays, np.ones((*rays.shape[:2], 1))], 2)
-
-
-def cast(
-    scene: Scene, camera: Pinhole, path: Path_, time: float, readout_s: float
-) -> tuple[Float64, Float64]:
-    """Return distances and albedos (H, W), each row at its own time."""
-    rays = homogeneous(camera)
-    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    rows = np.arange(camera.height)
-    times = time + readout_s * ((rows + 0.5) / camera.height - 0.5)
-    T = np.stack([path(t) for t in times]) if readout_s else np.tile(path(time), (len(rows), 1, 1))
-    directions = (rays @ np.swapaxes(T[:, :3, :3], 1, 2)).reshape(-1, 3)
-    origins = np.repeat(T[:, :3, 3], camera.width, 0)
-    hits = scene.cast(origins, directions)
-    shape = camera.height, camera.width
-    return hits.distance.reshape(shape).astype(float), hits.albedo.reshape(shape).astype(float)
-
-
-def both(recording: Recording) -> Iterator[tuple[str, Reconstruction]]:
+def both(recording: Recording, prior: Prior) -> Iterator[tuple[str, Reconstruction]]:
     """Yield the reconstructions without and with colour at full resolution."""
-    prior = "auto" if POSES_BY in recording.metadata else "none"
     recording, config = with_prior(recording, from_method("default", "range"), prior)
     for name, color in (("depth", False), ("colour", True)):
         yield name, reconstruct(recording, replace(config, refinement=Joint(color=color)))
 
 
-def print_simulated(names: list[str], seeds: int, **options: float) -> None:
+def print_simulated(names: list[str], seeds: int, **options: Any) -> None:
     """Print the table of simulated phones."""
     print("| scene | colour in | poses | posed | position rms, mm | rotation rms, deg | "
           "stated, mm | stated, deg | unbounded |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|---|")
-    for name in names:
-        for every in (1, 3):
-            for seed in range(seeds):
-                recording, truth = simulated(name, seed, every=every, **options)  # type: ignore[arg-type]
-                for method, result in both(recording):
-                    posed = result.has_pose
-                    metres, rad = displacement(result.trajectory[posed], truth[posed])
-                    stated = result.diagnostics.accuracy
-                    print(
-                        f"| {name} {seed} | 1 of {every} | {method} | {posed.sum()} | "
-                        f"{1000 * metres:.1f} | {np.degrees(rad):.2f} | "
-                        f"{1000 * stated.position_m:.1f} | {np.degrees(stated.rotation_rad):.2f} | "
-                        f"{len(stated.unbounded)} |",
-                        flush=True,
-                    )
+    for name, every, seed in product(names, (1, 3), range(seeds)):
+        planned = simulated(name, seed, every=every, **options)
+        with opened(planned) as recording:
+            for method, result in both(recording, "none"):
+                posed = result.has_pose
+                metres, rad = displacement(result.trajectory[posed], planned.poses[posed])
+                stated = result.diagnostics.accuracy
+                print(
+                    f"| {name} {seed} | 1 of {every} | {method} | {posed.sum()} | "
+                    f"{1000 * metres:.1f} | {np.degrees(rad):.2f} | "
+                    f"{1000 * stated.position_m:.1f} | {np.degrees(stated.rotation_rad):.2f} | "
+                    f"{len(stated.unbounded)} |",
+                    flush=True,
+                )
 
 
 # ---- Recordings ----------------------------------------------------------------------------------
@@ -242,7 +180,8 @@ def print_recorded(data: Path, names: list[str]) -> None:
             continue
         recording = open_recording(data / name)
         matches = epipolar_matches(recording)
-        for method, result in both(recording):
+        prior: Prior = "auto" if POSES_BY in recording.metadata else "none"
+        for method, result in both(recording, prior):
             P = result.trajectory
             distances = [
                 epipolar_distance(se3.inverse(P[j]) @ P[i], x_i, x_j, focal)

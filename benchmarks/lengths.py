@@ -16,17 +16,18 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-import phone
 import unusual
 from tofuse.apps.api.result import Result, reconstruct
 from tofuse.apps.certainty import LengthErrors
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames.depth_counts import depth_from_counts
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording
 from tofuse.engine.geometry import se3
@@ -34,6 +35,7 @@ from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.phone import PhonePlan
 from tofuse.lab.simulation.record import RecordingPlan
 from tofuse.lab.world import scene as scenes
 
@@ -129,14 +131,16 @@ def simulated(case: Case, camera: str, seed: int, focal: float) -> Taken:
     true = made.model.camera
     stated = replace(true, fx=focal * true.fx, fy=focal * true.fy)
     factory = sensor.factory_correction(model, effects)
-    rng, error = np.random.default_rng([seed, 5]), np.zeros((true.height, true.width))
+    times = made.raw / case.rate_hz
+    phone = PhonePlan(scene, sequence, times, seed=seed, depth=true, color_every=0)
     frames: list[RangeFrame] = []
     points: list[Float64] = []
-    for T, rendered in zip(made.poses, made.frames(None), strict=True):
+    taken = phone.frames() if camera == "phone" else repeat(None, case.frames)
+    for T, rendered, shot in zip(made.poses, made.frames(None), taken, strict=True):
         frame = rendered.frame
-        if camera == "phone":
-            error = phone._next_field(error, rng, first=not frames)
-            frame = phone._as_phone(frame, error)
+        if shot is not None:
+            depth = depth_from_counts(shot.depth, 0.001)
+            frame = RangeFrame(frame.index, frame.timestamp, true, depth)
         else:
             depth = corrected_depth(factory, frame.camera, frame.depth, frame.depth_kind)
             frame = replace(frame, depth=depth)
@@ -147,9 +151,7 @@ def simulated(case: Case, camera: str, seed: int, focal: float) -> Taken:
     metadata = {"frame_rate_hz": case.rate_hz, "sensor": f"lengths {camera}"}
     poses = made.poses
     if camera == "phone":
-        times = np.array([frame.timestamp for frame in frames])
-        up = sequence.T_room_camera(times[0])[:3, :3].T @ [0.0, 0.0, 1.0]
-        poses = phone.drifting(poses, times, up, phone.DRIFTS["usual"], rng)
+        poses = phone.device_poses()
         metadata |= {POSES_BY: "a simulated phone", "depth_kind": "z", "depth_unit_m": 0.001}
     source = ArraySource(frames, poses, metadata=metadata)
     return Taken(Recording.of(source, "simulated", "simulated"), stated, points, made.poses)

@@ -6,30 +6,31 @@ pair is left out if fewer than 100 matches fit within 2 pixels, or if two fits d
 1 degree and the worse one costs less than 1.1 times as much (degenerate geometry). Map consistency
 is that of `map_agreement`.
 
-`simulated`: phones with exact ground truth. Their depth is smooth, and its errors are too, over the
-image and over time; there is no amplitude. Their poses are true ones with drift: heading and
-position walk randomly, tilt is bounded; one kind relocalizes halfway, with a jump.
+`simulated`: phones with exact truth (`tofuse simulate --camera phone`). Their depth is smooth
+and late, and its errors are smooth over the image and over time; colour comes with every third
+frame; their own poses drift, and those of one kind jump halfway, as by a relocalization.
 
 `surface`: the surface of simulated phones at the true poses, as it is fused and as it is displayed
 (`display_surface`), compared with the true one: distance, share beyond 2 and 5 cm, and the share of
 the true surface within 2 cm of it (a camera sees only a part of the scene).
 
     python benchmarks/phone.py recorded [--names iphone_chair_3dscannerapp]
-    python benchmarks/phone.py simulated [--scenes room rail] [--seeds 2]
+    python benchmarks/phone.py simulated [--scenes room rail flat] [--seeds 2] [--frames 64]
     python benchmarks/phone.py surface [--scenes room flat] [--seeds 1]
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 
 import sequences
@@ -37,7 +38,7 @@ from fusion import views_of
 from tofuse.engine.arrays import Float32, Float64, Intp
 from tofuse.engine.cameras import scaled
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording, evenly_spaced
+from tofuse.engine.frames.recording import Recording, evenly_spaced
 from tofuse.engine.fusion import display_surface
 from tofuse.engine.fusion.tsdf import fuse_surface
 from tofuse.engine.geometry import se3
@@ -46,48 +47,24 @@ from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.map_agreement import map_consistency
 from tofuse.engine.quality.trajectory_errors import displacement
+from tofuse.engine.refinement import Joint
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.experiments.surface_error import Surface, distances
-from tofuse.lab.simulation.effects import Effects
-from tofuse.lab.simulation.record import plan
+from tofuse.lab.simulation.phone import PhoneErrors, PhonePlan, plan_phone, write_phone
 
 PHONES = ("iphone_chair_3dscannerapp", "iphone_record3d", "iphone_stray", "iphone_room")
 COLOR_IMAGES = 10  # evenly spaced
 RATIO, STARTS = 0.8, 6
 # A pair is left out with fewer matches within 2 pixels, or if another solution is nearly as good.
 MIN_MATCHES, AMBIGUOUS, SAME_RAD = 100, 1.1, np.radians(1.0)
-# Simulated depth: blur (pixels), and size and correlation of its errors over pixels and frames.
-BLUR, DEPTH_ERROR, WIDTH_PX, FRAMES = 1.5, 0.007, 25.0, 10.0
 # Displayed triangles and the views that judge them, as in a run; points on compared surfaces.
 TRIANGLES, WITNESSES, SAMPLES = 100_000, 60, 200_000
 
 
-@dataclass(frozen=True)
-class Drift:
-    """Errors of a phone's own poses: random walks per square root of a second, and of scale."""
-
-    heading_rad: float = np.radians(0.1)
-    tilt_rad: float = np.radians(0.1)  # bounded
-    position_m: float = 0.003
-    scale: float = 0.005
-    jump_m: float = 0.0
-    jump_rad: float = 0.0
-
-    def times(self, factor: float) -> Drift:
-        """Return larger errors."""
-        return replace(
-            self,
-            heading_rad=factor * self.heading_rad,
-            tilt_rad=factor * self.tilt_rad,
-            position_m=factor * self.position_m,
-            scale=factor * self.scale,
-        )
-
-
-DRIFTS = {
-    "usual": Drift(),
-    "five times": Drift().times(5),
-    "jump": Drift(jump_m=0.1, jump_rad=np.radians(2)),
+KINDS = {
+    "usual drift": PhoneErrors(),
+    "five times": PhoneErrors(drift=5.0),
+    "jump": PhoneErrors(jump=1.0),
 }
 
 
@@ -199,61 +176,11 @@ def rotation_errors(poses: Float64, measured: list[tuple[int, int, Float64]]) ->
 # ---- Simulated phones ----------------------------------------------------------------------------
 
 
-def simulated_phone(scene: str, seed: int, drift: Drift) -> tuple[Recording, Float64]:
-    """Return a simulated recording of a phone, and the true poses."""
-    planned = plan(scene, seed=seed, effects=Effects.none())
-    rng = np.random.default_rng([seed, 5])
-    frames = []
-    error = np.zeros((planned.model.camera.height, planned.model.camera.width))
-    for rendered in planned.frames(None):
-        error = _next_field(error, rng, first=not frames)
-        frames.append(_as_phone(rendered.frame, error))
-    times = np.array([frame.timestamp for frame in frames])
-    T_room_first = planned.sequence.T_room_camera(times[0])
-    poses = drifting(planned.poses, times, T_room_first[:3, :3].T @ [0.0, 0.0, 1.0], drift, rng)
-    metadata = {POSES_BY: "a simulated phone", "depth_kind": "z", "depth_unit_m": 0.001}
-    source = ArraySource(frames, poses, metadata=metadata)
-    return Recording.of(source, f"simulated {scene}", "simulated"), planned.poses
-
-
-def _next_field(before: Float64, rng: np.random.Generator, *, first: bool) -> Float64:
-    """Relative error of the depth of the next frame, smooth and correlated in time."""
-    field = gaussian_filter(rng.standard_normal(before.shape), WIDTH_PX, mode="reflect")
-    field *= DEPTH_ERROR / field.std()
-    kept = 0.0 if first else float(np.exp(-1 / FRAMES))
-    return np.asarray(kept * before + np.sqrt(1 - kept**2) * field)
-
-
-def _as_phone(frame: RangeFrame, error: Float64) -> RangeFrame:
-    depth = np.where(frame.valid, frame.depth, 0.0)
-    weight = gaussian_filter(frame.valid.astype(float), BLUR)
-    smooth = gaussian_filter(depth, BLUR) / np.maximum(weight, 1e-6) * (1 + error)
-    smooth = np.where(frame.valid, np.round(smooth, 3), 0.0).astype(np.float32)
-    return RangeFrame(
-        depth=smooth, depth_kind="z", camera=frame.camera, index=frame.index,
-        timestamp=frame.timestamp,
-    )  # fmt: skip
-
-
-def drifting(
-    poses: Float64, times: Float64, up: Float64, drift: Drift, rng: np.random.Generator
-) -> Float64:
-    """Poses (N, 4, 4) with drift in heading, tilt and position, and a jump halfway."""
-    root = np.sqrt(np.diff(times, prepend=times[0]))[:, None]
-    heading = drift.heading_rad * (root * rng.standard_normal((len(times), 1))).cumsum(0)
-    tilt = drift.tilt_rad * gaussian_filter(rng.standard_normal((len(times), 3)), (5, 0)) * 4
-    rotation = heading * up + tilt
-    position = drift.position_m * (root * rng.standard_normal((len(times), 3))).cumsum(0)
-    half = len(times) // 2
-    rotation[half:] += drift.jump_rad * up
-    position[half:] += drift.jump_m * np.array([0.6, 0.8, 0.0])
-    # Errors of motion add up in the frame of the camera's heading at the time.
-    turn = se3.exp(np.concatenate([np.zeros_like(rotation), rotation], 1))[:, :3, :3]
-    step = np.diff(poses[:, :3, 3], axis=0, prepend=poses[:1, :3, 3]) * (1 + drift.scale)
-    out = poses.copy()
-    out[:, :3, :3] = turn @ poses[:, :3, :3]
-    out[:, :3, 3] = (turn @ step[..., None])[..., 0].cumsum(0) + poses[0, :3, 3] + position
-    return out
+@contextmanager
+def opened(planned: PhonePlan) -> Iterator[Recording]:
+    """Yield a planned recording as it is read from the folder of its app."""
+    with tempfile.TemporaryDirectory() as folder:
+        yield open_recording(write_phone(planned, Path(folder) / "scan"))
 
 
 # ---- Rows ----------------------------------------------------------------------------------------
@@ -261,14 +188,16 @@ def drifting(
 
 def methods(recording: Recording) -> Iterator[tuple[str, Float64, float]]:
     """Yield the poses of each method, and the stated bound on their errors (m), NaN without."""
+    rows: list[tuple[str, Prior, bool]] = [
+        ("depth", "none", False),
+        ("depth, colour", "none", True),
+    ]
     if recording.reference is not None:
-        yield "phone alone", recording.reference, np.nan
-    priors: dict[str, Prior] = {"depth alone": "none", "both": "auto"}
-    for name, prior in priors.items():
-        if prior == "auto" and recording.reference is None:
-            continue
+        yield "phone", recording.reference, np.nan
+        rows += [("depth, phone", "auto", False), ("all", "auto", True)]
+    for name, prior, color in rows:
         source, config = with_prior(recording, from_method("default", "range"), prior)
-        result = reconstruct(source, config)
+        result = reconstruct(source, replace(config, refinement=Joint(color=color)))
         yield name, result.trajectory, result.diagnostics.accuracy.position_m
 
 
@@ -295,28 +224,32 @@ def recorded(data: Path, names: list[str]) -> None:
             )
 
 
-def simulated(scenes: list[str], seeds: int) -> None:
+def simulated(scenes: list[str], seeds: int, frames: int) -> None:
     """Print the table of simulated phones."""
-    print("| scene | drift | poses | position rms, mm | rotation rms, deg | map rms, mm | ", end="")
-    print("stated, mm | inside |")
+    print("| scene | poses of the phone | method | position rms, mm | rotation rms, deg | ", end="")
+    print("map rms, mm | stated, mm | inside |")
     print("|---|---|---|---|---|---|---|---|")
-    for scene in scenes:
-        for title, drift in DRIFTS.items():
-            errors: dict[str, list[tuple[float, float, float, float]]] = {}
-            for seed in range(seeds):
-                recording, truth = simulated_phone(scene, seed, drift)
+    for scene, (kind, errors) in product(scenes, KINDS.items()):
+        found: dict[str, list[tuple[float, float, float, float]]] = {}
+        for seed in range(seeds):
+            planned = plan_phone(scene, seed=seed, errors=errors, frames=frames)
+            with opened(planned) as recording:
                 for method, poses, bound in methods(recording):
-                    found = (*_errors(recording, poses, truth), bound)
-                    errors.setdefault(method, []).append(found)
-            for method, rows in errors.items():
-                position, rotation, rms, stated = np.sqrt((np.array(rows) ** 2).mean(0))
-                inside = sum(error <= bound for error, _, _, bound in rows)
-                print(
-                    f"| {scene} | {title} | {method} | {1000 * position:.1f} | "
-                    f"{np.degrees(rotation):.2f} | {1000 * rms:.1f} | {1000 * stated:.1f} | "
-                    f"{inside} of {len(rows)} |",
-                    flush=True,
-                )
+                    row = (*_errors(recording, poses, planned.poses), bound)
+                    found.setdefault(method, []).append(row)
+        for method, rows in found.items():
+            position, rotation, rms, stated = np.sqrt((np.array(rows) ** 2).mean(0))
+            inside = sum(error <= bound for error, _, _, bound in rows)
+            print(
+                f"| {scene} | {kind} | {method} | {1000 * position:.1f} | "
+                f"{np.degrees(rotation):.2f} | {1000 * rms:.1f} | "
+                + (
+                    "- | - |"
+                    if method == "phone"
+                    else f"{1000 * stated:.1f} | {inside} of {seeds} |"
+                ),
+                flush=True,
+            )
 
 
 def _errors(recording: Recording, poses: Float64, truth: Float64) -> tuple[float, float, float]:
@@ -325,34 +258,33 @@ def _errors(recording: Recording, poses: Float64, truth: Float64) -> tuple[float
     return metres, rad, map_consistency(recording, poses).rms_m
 
 
-def surfaces(scenes: list[str], seeds: int) -> None:
+def surfaces(scenes: list[str], seeds: int, frames: int) -> None:
     """Print the table of surfaces."""
     print("| scene | seed | surface | triangles | mean, mm | > 2 cm | > 5 cm | complete |")
     print("|---|---|---|---|---|---|---|---|")
-    for scene in scenes:
-        for seed in range(seeds):
-            recording, poses = simulated_phone(scene, seed, DRIFTS["usual"])
-            frames = [f for f in recording if isinstance(f, RangeFrame)]
-            views, _, _ = views_of(frames, from_method("default", "range"))
-            made = plan(scene, seed=seed, effects=Effects.none())
-            vertices, faces = made.scene.truth_mesh()
-            T_world_truth = made.sequence.T_world_truth(made.raw[0] / made.sequence.frame_rate_hz)
-            truth = Surface(se3.transform(T_world_truth, vertices), faces)
-            fused = fuse_surface(views, poses).clustered(TRIANGLES)
-            seen = evenly_spaced(np.arange(len(frames)), WITNESSES)
-            witnesses = [display_surface.Witness.of(frames[k], poses[k]) for k in seen]
-            shown, filled = display_surface.displayed(fused, witnesses)
-            for name, mesh in (("fused", fused), (f"displayed, {filled} in holes", shown)):
-                shape = Surface(mesh.vertices, mesh.faces)
-                error = distances(shape.samples(SAMPLES)[0], truth)
-                missed = distances(truth.samples(SAMPLES)[0], shape)
-                print(
-                    f"| {scene} | {seed} | {name} | {len(mesh.faces)} | "
-                    f"{1000 * error.mean():.1f} | "
-                    f"{(error > 0.02).mean():.2%} | {(error > 0.05).mean():.2%} | "
-                    f"{(missed < 0.02).mean():.2%} |",
-                    flush=True,
-                )
+    for scene, seed in product(scenes, range(seeds)):
+        planned = plan_phone(scene, seed=seed, frames=frames)
+        with opened(replace(planned, color_every=len(planned.times))) as recording:
+            images = [f for f in recording if isinstance(f, RangeFrame)]
+        poses = planned.poses
+        views, _, _ = views_of(images, from_method("default", "range"))
+        vertices, faces = planned.scene.truth_mesh()
+        T_world_truth = planned.motion.T_world_truth(planned.times[0])
+        truth = Surface(se3.transform(T_world_truth, vertices), faces)
+        fused = fuse_surface(views, poses).clustered(TRIANGLES)
+        seen = evenly_spaced(np.arange(len(images)), WITNESSES)
+        witnesses = [display_surface.Witness.of(images[k], poses[k]) for k in seen]
+        shown, filled = display_surface.displayed(fused, witnesses)
+        for name, mesh in (("fused", fused), (f"displayed, {filled} in holes", shown)):
+            shape = Surface(mesh.vertices, mesh.faces)
+            error = distances(shape.samples(SAMPLES)[0], truth)
+            missed = distances(truth.samples(SAMPLES)[0], shape)
+            print(
+                f"| {scene} | {seed} | {name} | {len(mesh.faces)} | {1000 * error.mean():.1f} | "
+                f"{(error > 0.02).mean():.2%} | {(error > 0.05).mean():.2%} | "
+                f"{(missed < 0.02).mean():.2%} |",
+                flush=True,
+            )
 
 
 def main() -> None:
@@ -362,19 +294,18 @@ def main() -> None:
     real = commands.add_parser("recorded")
     real.add_argument("--data", type=Path, default=sequences.DATA)
     real.add_argument("--names", nargs="+", default=list(PHONES))
-    made = commands.add_parser("simulated")
-    made.add_argument("--scenes", nargs="+", default=["room", "rail"])
-    made.add_argument("--seeds", type=int, default=2)
-    shown = commands.add_parser("surface")
-    shown.add_argument("--scenes", nargs="+", default=["room", "flat"])
-    shown.add_argument("--seeds", type=int, default=1)
+    for name, scenes in (("simulated", ["room", "rail"]), ("surface", ["room", "flat"])):
+        made = commands.add_parser(name)
+        made.add_argument("--scenes", nargs="+", default=scenes)
+        made.add_argument("--seeds", type=int, default=2)
+        made.add_argument("--frames", type=int, default=64)
     options = parser.parse_args()
     if options.command == "recorded":
         recorded(options.data, options.names)
     elif options.command == "surface":
-        surfaces(options.scenes, options.seeds)
+        surfaces(options.scenes, options.seeds, options.frames)
     else:
-        simulated(options.scenes, options.seeds)
+        simulated(options.scenes, options.seeds, options.frames)
 
 
 if __name__ == "__main__":

@@ -11,11 +11,11 @@ from typing import Any
 
 from tofuse.apps.jobs import Options, resolve, run
 from tofuse.apps.results import folders
-from tofuse.engine.errors import OutputError
+from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.files import atomic, staging
-from tofuse.lab.simulation import Effects, Passing, simulate
+from tofuse.lab.simulation import Effects, Passing, phone, simulate
 
 # Settings of the thesis per scene (section 4.1): points beyond the object are removed.
 _SCENE_OPTIONS: dict[str, dict[str, Any]] = {
@@ -111,6 +111,13 @@ def _is_simulated(folder: Path) -> bool:
     return (folder / "truth").is_dir() or not any(folder.iterdir())
 
 
+def _refuse(**options: object) -> None:
+    """Check that options are not given that the simulated phone does not have."""
+    for name, value in options.items():
+        if value:
+            raise InputError("a simulated phone doesn't have this", where=name, remedy="omit it")
+
+
 # Section 4.1.6: all points, no filters; and a resolution of 1 m. Loops would be 3 m apart.
 PEAKS_CONFIG = """\
 filters = []
@@ -146,7 +153,8 @@ def simulate_to(
 ) -> int:
     """Write a simulated recording; returns its number of frames.
 
-    `without` names effects to switch off, or is ("all",); see `Effects.without`.
+    `without` names effects to switch off, or is ("all",); see `Effects.without`, and
+    `phone.PhoneErrors` for the camera "phone", whose folder is one of 3d Scanner App.
 
     Raises
     ------
@@ -156,7 +164,6 @@ def simulate_to(
         If the folder can't be written, or is not empty.
     """
     progress = progress or Silent()
-    effects = Effects().without(*without)
     completed = 0
 
     def report(done: int, total: int) -> None:
@@ -167,25 +174,32 @@ def simulate_to(
         progress.advance()
 
     created = not out.exists() or (out.is_dir() and not any(out.iterdir()))
-    options: dict[str, Any] = {} if sigma is None else {"sigma_m": sigma}
+    noise: dict[str, Any] = {} if sigma is None else {"sigma_m": sigma}
+    selection: dict[str, Any] = {"every": every, "frames": frames, "first": first}
     try:
-        simulate(
-            scene,
-            out,
-            camera=camera,
-            seed=seed,
-            effects=effects,
-            every=every,
-            frames=frames,
-            first=first,
-            passing=passing,
-            mirror=mirror,
-            correction=correction,
-            texture=texture,
-            imu=imu,
-            progress=report,
-            **options,
-        )
+        if camera == phone.NAME:
+            _refuse(passing=passing, mirror=mirror, imu=imu, no_correction=not correction)
+            errors = phone.PhoneErrors().without(*without)
+            planned = phone.plan_phone(
+                scene, seed=seed, errors=errors, texture=texture, **selection
+            )
+            phone.write_phone(planned, out, report)
+        else:
+            simulate(
+                scene,
+                out,
+                camera=camera,
+                seed=seed,
+                effects=Effects().without(*without),
+                passing=passing,
+                mirror=mirror,
+                correction=correction,
+                texture=texture,
+                imu=imu,
+                progress=report,
+                **selection,
+                **noise,
+            )
     except BaseException:
         if created:
             shutil.rmtree(out, ignore_errors=True)

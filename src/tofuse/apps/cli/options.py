@@ -676,9 +676,9 @@ class Simulate(Seed, Threads):
     out : DIR
         output folder
     camera : NAME
-        camera model (sr4000)
+        camera model, or `phone` (sr4000)
     every : N
-        stride (default: the thesis's)
+        stride (default: the thesis's; 6 for a phone)
     frames : N
         stop after this many frames
     first : K

@@ -167,9 +167,9 @@ def desk(assembly: Assembly, T: Float64) -> None:
     )
 
 
-LEAF = Material("leaf", 0.5, 0.12, "noise", (0.05, 0.05, 0.05))
+LEAF = Material("leaf", 0.5, 0.12, "noise", (0.05, 0.05, 0.05), hue=0.3)
 STEM = Material("stem", 0.35)
-POT = Material("pot", 0.45, 0.06, "noise", (0.1, 0.1, 0.1))
+POT = Material("pot", 0.45, 0.06, "noise", (0.1, 0.1, 0.1), hue=0.04)
 SOIL = Material("soil", 0.2, 0.25, "speckle", (0.02, 0.02, 0.02))
 
 

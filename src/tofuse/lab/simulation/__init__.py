@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.lab.simulation import optics, peaks
+    from tofuse.lab.simulation import optics, peaks, phone
     from tofuse.lab.simulation.effects import Effects
     from tofuse.lab.simulation.models import CAMERAS, CameraModel, camera_model
     from tofuse.lab.simulation.passing import Passing

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.errors import InputError
 from tofuse.engine.frames import ArraySource, RangeFrame, Recording
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
@@ -27,6 +26,7 @@ from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.passing import Passing, add_distractor
 from tofuse.lab.simulation.peaks import peaks_cameras, peaks_points, peaks_views
 from tofuse.lab.simulation.render import RenderedFrame, render
+from tofuse.lab.simulation.truth import write_surface
 from tofuse.lab.world import scene as scenes
 
 # Called with the number of frames done and the total.
@@ -118,15 +118,7 @@ def plan(
     """
     model = camera_model(camera)
     built, sequence = scenes.build(scene, seed=seed, texture=texture, axis_offset_m=axis_offset_m)
-    stride = sequence.stride if every is None else every
-    for name, value in (("every", stride), ("frames", 1 if frames is None else frames)):
-        if value < 1:
-            raise InputError(f"is {value}", where=name, remedy="use 1 or more")
-    if not 0 <= first < sequence.frames:
-        raise InputError(
-            f"is {first}", where="first", remedy=f"use one from 0 to {sequence.frames - 1}"
-        )
-    raw = np.arange(first, sequence.frames, stride)[:frames]
+    raw = sequence.selected(every, frames, first)
     if mirror is not None:
         times = raw / sequence.frame_rate_hz
         built, _ = hang_mirror(built, sequence, model, mirror, times=times, seed=seed)
@@ -294,13 +286,8 @@ def write(
         write_png(flags / f"{k:06d}.png", rendered.flags)
         counts = np.round(rendered.depth.astype(float) / model.depth_unit_m)
         write_png(depths / f"{k:06d}.png", np.where(counts < 65535, counts, 0).astype(np.uint16))
-    vertices, faces = planned.scene.truth_mesh()
-    T = planned.sequence.T_world_truth(planned.raw[0] / planned.sequence.frame_rate_hz)
-    write_ply(
-        truth / "surface.ply",
-        GeometryRecord(se3.transform(T, vertices), faces=faces.astype(np.int32)),
-    )
     times = planned.raw / planned.sequence.frame_rate_hz
+    write_surface(truth, planned.scene, planned.sequence, times[0])
     return writer.finish(
         groundtruth=planned.poses,
         correction=planned.correction if correction else None,

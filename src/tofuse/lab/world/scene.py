@@ -15,7 +15,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tofuse.engine.arrays import Float32, Float64, Int32, Int64
+from tofuse.engine.arrays import Float32, Float64, Int32, Int64, Intp
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
@@ -264,6 +264,24 @@ class Sequence:
     camera_path: Path = field(repr=False)
     object_path: Path | None = field(default=None, repr=False)
     passing_paths: tuple[Path, ...] = field(default=(), repr=False)
+
+    def selected(self, every: int | None = None, frames: int | None = None, first: int = 0) -> Intp:
+        """Return the indices of every `every`-th raw frame from `first` on, at most `frames`.
+
+        Raises
+        ------
+        InputError
+            For a stride or number of frames below 1, or a first frame out of range.
+        """
+        stride = self.stride if every is None else every
+        for name, value in (("every", stride), ("frames", 1 if frames is None else frames)):
+            if value < 1:
+                raise InputError(f"is {value}", where=name, remedy="use 1 or more")
+        if not 0 <= first < self.frames:
+            raise InputError(
+                f"is {first}", where="first", remedy=f"use one from 0 to {self.frames - 1}"
+            )
+        return np.arange(first, self.frames, stride)[:frames]
 
     def T_room_camera(self, t: float) -> Float64:
         """(4, 4) pose of the camera in the room at time t in s."""

@@ -43,6 +43,8 @@ class Material:
         Size of the largest features along the three axes of the body's frame.
     gloss
         Fraction of the light that is reflected specularly, 0 to 1.
+    hue
+        Of its visible colour, 0 to 1; None: any that is usual for its pattern.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Material:
     pattern: Pattern = "plain"
     scale_m: tuple[float, float, float] = (0.5, 0.5, 0.5)
     gloss: float = 0.0
+    hue: float | None = None
 
     def uniform(self) -> Self:
         """Return the same surface, matte and with the common albedo of uniform surfaces."""
