@@ -281,3 +281,25 @@ def test_odometry_after_gap_is_not_used() -> None:
         motion.update(poses[k], counted(k))
     motion.set_odometry(se3.exp(np.array([0, 0, 0, 0, 1.0, 0])))
     np.testing.assert_allclose(motion.predicted_pose(counted(12)), poses[12], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("noise", "jump", "frames", "trusted"),
+    [(0.0, 0.0, 12, True), (0.05, 0.0, 12, False), (0.0, 0.5, 12, False), (0.0, 0.0, 3, False)],
+)
+def test_odometry_is_trusted_if_it_predicted_better_and_did_not_jump(
+    noise, jump, frames, trusted
+) -> None:
+    rng = np.random.default_rng(5)
+    shaken = [T @ se3.exp(np.array([*rng.normal(0, 0.01, 6)])) for T in walk(frames)]
+    sensed = [T @ se3.exp(np.array([*rng.normal(0, noise, 6)])) for T in shaken]
+    sensed[-1] = sensed[-1] @ se3.exp(np.array([jump, 0, 0, 0, 0, 0]))
+    motion = MotionModel()
+    for k in range(frames - 1):
+        motion.set_odometry(sensed[k])
+        motion.update(shaken[k], counted(k))
+    motion.set_odometry(sensed[-1])
+    T = motion.trusted_odometry_pose(counted(frames - 1))
+    assert (T is not None) is trusted
+    if trusted:
+        np.testing.assert_allclose(T, shaken[-1], atol=1e-9)

@@ -179,6 +179,24 @@ def test_fast_turn_measured_by_odometry_needs_no_search() -> None:
         assert off(step, pose, path[0])[0] < 0.03
 
 
+@pytest.mark.parametrize(("jump", "kept"), [(0.0, True), (0.5, False)])
+def test_view_that_fits_nowhere_keeps_the_pose_of_proven_odometry(jump, kept) -> None:
+    """One view of another room; odometry that jumps there as well proves nothing."""
+    rng = np.random.default_rng(6)
+    path = [T @ se3.exp([*rng.normal(0, 0.01, 3), 0, 0, 0]) for T in WALK]
+    frames = [seen(T, k) for k, T in enumerate(path)]
+    k = 14
+    frames[k] = seen(path[k], k, boxes=(), spots=90, scene=9, half=(2.6, 1.4, 2.4))
+    odometry = [at(jump if n >= k else 0.0, 0.0, 0.0) @ T for n, T in enumerate(path)]
+    steps = run(frames, odometry, Keyframes(searches=False))
+    assert (steps[k].component == 0) is kept
+    if kept:
+        assert "by odometry" in steps[k].reason
+        assert len(steps[k].registration.unobservable) == 6
+        assert max(step.component for step in steps) == 0
+        assert max(off(s, T, path[0])[0] for s, T in zip(steps, path, strict=True)) < 0.03
+
+
 @pytest.mark.nightly
 def test_new_component_continues_motion() -> None:
     """Another room from one frame to the next, with the same camera motion."""

@@ -30,6 +30,9 @@ from tofuse.engine.views import PreparedView
 _MIN_ROTATED_SCORE_RATIO = 1.03
 # A nearly aligned view needs a few more iterations, at the resolution of tracking.
 _CONVERGENCE_LEVELS = (projective.Level(4, 8, 0.005, 0.02), projective.Level(2, 8, 0.0, 0.0))
+# A view that is compared with a reference where it is.
+_NO_STEPS = (projective.Level(2, 1, 0.0, 0.0),)
+_MISFIT = verification.FitQuality("conflicting")
 _BACKGROUND = 0.9  # quantile of the depths that the farther surfaces of a view have
 # Between frames that are farther apart, a camera neither stands still nor goes on as before.
 _MAX_STEP_RAD = 0.2
@@ -108,6 +111,8 @@ class Hypothesis:
         Unusual origin of the alignment, in words; may be empty.
     fit
         Comparison with usual alignments.
+    by_odometry
+        Whether the pose is that of external odometry, and not aligned.
     """
 
     aligned: projective.Aligned
@@ -116,6 +121,7 @@ class Hypothesis:
     predicted: bool
     note: str
     fit: verification.FitQuality
+    by_odometry: bool = False
 
     @property
     def keyframe(self) -> Keyframe:
@@ -208,6 +214,17 @@ class Hypotheses:
         """Realign from a pose T (4, 4), with other pixels of the view or the reference."""
         aligned = self._align(view, reference, T, self._options)
         return self._hypothesis(aligned, view, reference, "", predicted=predicted)
+
+    def by_odometry(self) -> Hypothesis | None:
+        """Return the pose by trusted external odometry, of which the view constrains nothing."""
+        T = self.state.motion.trusted_odometry_pose(self.now)
+        if T is None or not self.references:
+            return None
+        reference = self.references[0]
+        unaligned = self._align(self.view, reference, T, replace(self._options, levels=_NO_STEPS))
+        aligned = replace(unaligned, T_world_source=T, unobservable=np.eye(6))
+        note = f"by odometry: {self.first_rejection}"
+        return Hypothesis(aligned, self.view, reference, True, note, _MISFIT, True)
 
     def converged(self, hypothesis: Hypothesis) -> Hypothesis:
         """Iterate a hypothesis to convergence, for which the default levels may not suffice."""

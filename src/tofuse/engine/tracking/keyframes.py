@@ -180,10 +180,11 @@ class KeyframeTracker(Tracker):
         self, frame: RangeFrame, selected: Hypothesis, hypotheses: Hypotheses
     ) -> Step:
         """Refine the selected hypothesis without moving objects, and take its pose."""
-        view = hypotheses.view
-        accepted, moving = hypotheses.segment(hypotheses.converged(selected))
-        accepted, moving, rival = hypotheses.with_rival(accepted, moving)
-        self._state.fit_statistics.learn(accepted.aligned, view.depth)
+        view, accepted, moving, rival = hypotheses.view, selected, None, 0.0
+        if not selected.by_odometry:
+            accepted, moving = hypotheses.segment(hypotheses.converged(selected))
+            accepted, moving, rival = hypotheses.with_rival(accepted, moving)
+            self._state.fit_statistics.learn(accepted.aligned, view.depth)
         links = self._insert_keyframe(view, accepted)
         status, reason = _status_of(accepted, frame)
         mask, moved = None, 0.0

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64
+from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.geometry import distance_and_angle, retract, se3, twist_between
 
 # Minimum of the gate, m and rad: handheld cameras at 5 to 30 frames a second stay below. At lower
@@ -34,6 +34,8 @@ _TRACKING_NOISE = np.array([0.003, np.radians(0.2)])
 _NEWEST_WEIGHT = 0.3
 # Number of recent motions over which external odometry is compared with the velocity.
 _COMPARISON_WINDOW = 10
+# With fewer, odometry is not trusted more than a view that contradicts it.
+_MIN_COMPARED = 3
 # Without timestamps, no motion is predicted across more frames without a pose than this.
 _MAX_UNTIMED_GAP = 3
 
@@ -103,6 +105,20 @@ class MotionModel:
         if T is None or before is None or now is None:
             return None
         return np.asarray(T @ se3.inverse(before) @ now, np.float64)
+
+    def trusted_odometry_pose(self, now: FrameTime) -> Float64 | None:
+        """Return the pose by external odometry if it deserves more trust than a view that misfits.
+
+        That is if it predicted recent motions better than the velocity did, and did not jump:
+        otherwise, and without odometry, None.
+        """
+        T, T_velocity = self.odometry_pose(), self._extrapolated(self._velocity, now)
+        if T is None or T_velocity is None or len(self._prediction_errors) < _MIN_COMPARED:
+            return None
+        if not self._odometry_predicts_better().all():
+            return None
+        within = (_distance_and_angle(T_velocity, T) <= self.gate(now)).all()
+        return T if within else None
 
     def smoothed_pose(self, now: FrameTime) -> Float64 | None:
         """Return the pose at the mean velocity of recent frames; None while it is unknown.
@@ -176,14 +192,18 @@ class MotionModel:
             return T
         if T is None:
             return T_odometry if self.is_feasible(T_odometry, now) else None
-        by_odometry, by_velocity = np.median(self._prediction_errors or [np.zeros((2, 2))], axis=0)
-        use_position, use_rotation = by_odometry <= by_velocity
+        use_position, use_rotation = self._odometry_predicts_better()
         fused = T.copy()
         if use_position:
             fused[:3, 3] = T_odometry[:3, 3]
         if use_rotation:
             fused[:3, :3] = T_odometry[:3, :3]
         return fused
+
+    def _odometry_predicts_better(self) -> Bool:
+        """Whether odometry predicted recent positions and rotations as well as the velocity did."""
+        by_odometry, by_velocity = np.median(self._prediction_errors or [np.zeros((2, 2))], axis=0)
+        return np.asarray(by_odometry <= by_velocity)
 
     def _compare_odometry(self, T: Float64, now: FrameTime) -> None:
         """Record how well odometry and velocity predicted a pose (4, 4)."""

@@ -66,8 +66,8 @@ class Selection:
     ===========================  ============================================================
     well constrained             it
     degenerate                   the best of it and of better constrained alignments
-    none                         the best uncertain one; else a motion of which a search is
-                                 certain
+    none                         the best uncertain one; else that of external odometry, where
+                                 it is trusted; else one of which a search is certain
     ===========================  ============================================================
     """
 
@@ -81,7 +81,7 @@ class Selection:
         if not self._state.in_sequence:
             return first
         if first is None:
-            return self._best_uncertain() or self._by_search()
+            return self._best_uncertain() or self._hypotheses.by_odometry() or self._by_search()
         return self._better_constrained(first) if len(first.aligned.unobservable) else first
 
     def _first_acceptable(self) -> Hypothesis | None:

@@ -37,8 +37,10 @@ DEPTH = scaled(COLOR, 256, 192)
 # Raw frames from one image to the next (5 a second), and frames from one with colour to the next.
 STRIDE, COLOR_EVERY = 6, 3
 
-# Size (of the image's width) and duration in s of errors of depth, and depth without confidence.
-_SIZE, _DURATION_S, _FAR_M = 0.1, 2.0, 5.0
+# Errors of depth, as residuals of iPhones to their fused surfaces show them: shares of the variance
+# that stays with the image, and that lasts some time; the rest is new in each image.
+_STAYS, _LASTS, _DURATION_S, _SIZE = 0.3, 0.3, 2.0, 0.1  # size as a fraction of the width
+_FAR_M = 5.0  # depth without confidence
 _EDGE, _EDGE_PX = 0.05, 3  # relative step of depth, and width, of what is called an edge
 # Drift: random walks per square root of a second, tilt that stays bounded, and scale.
 _HEADING_RAD, _TILT_RAD, _POSITION_M, _SCALE = np.radians(0.1), np.radians(0.1), 0.003, 0.005
@@ -68,7 +70,7 @@ class PhoneErrors:
     Attributes
     ----------
     depth
-        Relative error of the depth, rms, smooth over the image and over two seconds.
+        Relative error of the depth, rms, smooth over the image, partly over time.
     blur
         Pixels by which depth is smoothed (sigma); edges of iPhones are 1.5 to 3 pixels wide.
     lag
@@ -85,7 +87,7 @@ class PhoneErrors:
         Factor on a jump of 0.1 m and 2 degrees in the middle, as by a relocalization.
     """
 
-    depth: float = 0.007
+    depth: float = 0.005
     blur: float = 0.7
     lag: float = 0.02
     shutter: float = 0.015
@@ -177,11 +179,15 @@ class PhonePlan:
         """Render the frames."""
         rng = np.random.default_rng([self.seed, 5])
         palette = _palette(self.scene.materials, self.seed)
-        field = np.zeros((self.depth.height, self.depth.width))
+        shape = self.depth.height, self.depth.width
+        stays, lasts = _smooth(rng, shape), _smooth(rng, shape)
         gain, white, steps = 0.0, np.ones(3), np.diff(self.times, prepend=-np.inf)
         for k, (t, step) in enumerate(zip(self.times, steps, strict=True)):
-            field = _next_field(field, float(np.exp(-step / _DURATION_S)), rng)
-            depth, confidence = self._depth(t, 1 + self.errors.depth * field)
+            kept = np.exp(-step / _DURATION_S)
+            lasts = kept * lasts + np.sqrt(1 - kept**2) * _smooth(rng, shape)
+            new = np.sqrt(1 - _STAYS - _LASTS) * _smooth(rng, shape)
+            error = np.sqrt(_STAYS) * stays + np.sqrt(_LASTS) * lasts + new
+            depth, confidence = self._depth(t, 1 + self.errors.depth * error)
             color = None
             if self.color_every and k % self.color_every == 0:
                 light = self._light(t, palette)
@@ -255,12 +261,10 @@ def drifting(
     return out
 
 
-def _next_field(before: Float64, kept: float, rng: np.random.Generator) -> Float64:
-    """Return the next smooth field of unit variance, of which `kept` is that before."""
-    field = gaussian_filter(
-        rng.standard_normal(before.shape), _SIZE * before.shape[1], mode="reflect"
-    )
-    return np.asarray(kept * before + np.sqrt(1 - kept**2) * field / field.std())
+def _smooth(rng: np.random.Generator, shape: tuple[int, int]) -> Float64:
+    """Return a smooth random field of unit variance."""
+    field = gaussian_filter(rng.standard_normal(shape), _SIZE * shape[1], mode="reflect")
+    return np.asarray(field / field.std())
 
 
 @dataclass(frozen=True, eq=False)
