@@ -33,8 +33,7 @@ from scipy.optimize import least_squares
 from tofuse.apps.jobs import Options, run
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.frames import RangeFrame, Recording
-from tofuse.engine.fusion import Mesh, Textured, display_colors
-from tofuse.engine.fusion.atlas_kernels import NO_TRIANGLE, draw_triangles
+from tofuse.engine.fusion import Mesh, Textured, display_colors, drawn
 from tofuse.engine.fusion.display_surface import TOLERANCE_FRACTION, TOLERANCE_M
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import texturing
@@ -45,7 +44,7 @@ LEFT_OUT, _MANY = 10, 20  # every tenth image, or of fewer than 20 images every 
 _SSIM_C1, _SSIM_C2, _SSIM_SIGMA = (0.01 * 255) ** 2, (0.03 * 255) ** 2, 1.5
 _WIDTH = 960  # pixels of the compared images, or as recorded if that is less
 _OPEN3D_ITERATIONS = 50
-_SAMPLES, _NEAREST = 2, 0.05  # samples per pixel of rendered images, and m to the nearest surface
+_NEAREST = 0.05  # m to the nearest rendered surface
 _EDGE = 9  # pixels at edges of depth that are not compared
 _ALIGNMENTS, _MAX_SHIFT = 3, 0.05  # of the pose of an image; largest shift, in widths of the image
 
@@ -278,53 +277,20 @@ def _ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray) -> float:
 def rendered(
     model: Mesh | Textured, camera: Any, T_world_camera: np.ndarray, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Render a model at a pose: image (H, W, 3), and z (H, W), 0 where it does not cover a pixel.
-
-    Triangles are drawn from the farthest to the nearest, with `_SAMPLES`^2 samples per pixel.
-    """
-    width, height = _SAMPLES * size[0], _SAMPLES * size[1]
+    """Render a model at a pose: image (H, W, 3), and z (H, W), 0 where it covers no pixel."""
     mesh = model.charts if isinstance(model, Textured) else model
     T = se3.inverse(T_world_camera)
     p = mesh.vertices.astype(float) @ T[:3, :3].T + T[:3, 3]
     z = np.maximum(p[:, 2], 1e-6)
     pixels = (camera.project(np.c_[p[:, :2] / z[:, None], np.ones(len(p))]) + 0.5) * [
-        width / camera.width,
-        height / camera.height,
+        size[0] / camera.width,
+        size[1] / camera.height,
     ] - 0.5
-    corners, depths = pixels[mesh.faces], p[mesh.faces, 2]
-    low, high = corners.min(1), corners.max(1)
-    front = (depths > _NEAREST).all(1) & (high >= 0).all(1) & (low < [width, height]).all(1)
-    order = np.flatnonzero(front)
-    order = order[np.argsort(-depths[order].mean(1), kind="stable")]
-    owner = np.full((height, width), NO_TRIANGLE, np.int32)
-    place = np.zeros((height, width, 2), np.float32)
-    draw_triangles(corners[order].astype(np.float32), 0.0, owner, place)
-    covered = owner != NO_TRIANGLE
-    faces, (b, c) = order[owner[covered]], place[covered].T
-    weight = np.stack([1 - b - c, b, c], -1) / depths[faces]  # interpolated in perspective
-    far = 1 / weight.sum(-1)
-    weight *= far[:, None]
-    if isinstance(model, Textured):
-        texel = np.einsum("nk,nki->in", weight, model.atlas.texels[mesh.faces[faces]])
-        value = _sampled(model.image, *texel.astype(np.float32)[:, None])
-    else:
-        assert mesh.color is not None
-        colors = display_colors(mesh.color).astype(np.float32)[mesh.faces[faces]]
-        value = np.einsum("nk,nki->ni", weight, colors)
-    image, distance = np.zeros((height, width, 3), np.float32), np.zeros((height, width))
-    image[covered], distance[covered] = value, far
-    smaller = [cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (image, distance)]
-    whole = covered.reshape(size[1], _SAMPLES, size[0], _SAMPLES).all((1, 3))
-    return smaller[0], np.where(whole, smaller[1], 0)
-
-
-def _sampled(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Interpolate an image at (1, N) positions; in rows, as OpenCV limits their length."""
-    count, side = u.shape[1], 16_384
-    rows = -(-count // side)
-    u, v = (np.pad(x[0], (0, rows * side - count)).reshape(rows, side) for x in (u, v))
-    sampled = cv2.remap(image, u, v, cv2.INTER_LINEAR).astype(np.float32)
-    return np.asarray(sampled.reshape(-1, 3)[:count])
+    assert mesh.color is not None
+    mesh = replace(mesh, color=display_colors(mesh.color))
+    texture = model if isinstance(model, Textured) else None
+    shown = (p[mesh.faces, 2] > _NEAREST).all(1)
+    return drawn(mesh, pixels, p[:, 2], shown, size, texture)
 
 
 if __name__ == "__main__":

@@ -24,11 +24,16 @@ class Picture:
     Parameters
     ----------
     shown
-        (N, 3) world points (x right, y down) that have to be in the picture.
+        (N, 3) world points that have to be in the picture.
+    up
+        (3,) unit vector, up in the world.
+    paint
+        Share of the surface's own colour: albedo of dark things hides their shape.
     """
 
-    def __init__(self, shown: Float64) -> None:
-        self.R = se3.so3_exp([TILT, 0.0, 0.0]) @ se3.so3_exp([0.0, TURN, 0.0])
+    def __init__(self, shown: Float64, up: Float64, paint: float = 0.5) -> None:
+        self.R = se3.so3_exp([TILT, 0.0, 0.0]) @ se3.so3_exp([0.0, TURN, 0.0]) @ _upright(up)
+        self.paint = paint
         seen = shown @ self.R.T
         low, high = np.percentile(seen, [0.5, 99.5], axis=0)
         self.centre = (low + high) / 2
@@ -66,13 +71,13 @@ class Picture:
         )  # fmt: skip
         seen = hit >= 0
         face, weights = order[hit[seen]], weights[seen]
-        shade = 0.3 + 0.7 * light[face]
+        least = 0.3 if self.paint < 1 else 0.7  # images are lit already
+        shade = least + (1 - least) * light[face]
         color = mesh.color if mesh.color is not None else np.full((len(vertices), 3), 150, np.uint8)
         at = faces[face]
         parts = np.column_stack([1 - weights.sum(axis=1), weights])
         mixed = np.einsum("nk,nkc->nc", parts, color[at].astype(float))
-        # Half of the colour is the surface's own: albedo of dark things hides their shape.
-        mixed = 0.5 * mixed + 0.5 * 190.0
+        mixed = self.paint * mixed + (1 - self.paint) * 190.0
         flat = self.image.reshape(-1, 3)
         flat[seen] = np.clip(mixed * shade[:, None], 0, 255)[:, ::-1].astype(np.uint8)
 
@@ -99,3 +104,12 @@ class Picture:
 
     def _pixels(self, seen: Float64) -> Float64:
         return (seen[:, :2] - self.centre[:2]) * self.scale + np.array(SIZE) / 2
+
+
+def _upright(up: Float64) -> Float64:
+    """Return the smallest rotation (3, 3) that takes `up` to -y."""
+    axis, cosine = np.cross(up, [0.0, -1.0, 0.0]), -float(up[1])
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-9:
+        return np.diag([1.0, np.sign(cosine), np.sign(cosine)])
+    return np.asarray(se3.so3_exp(np.arctan2(sine, cosine) * axis / sine))

@@ -13,7 +13,7 @@ from tofuse.apps.report import thumbnails
 from tofuse.apps.report.packing import normal_bytes, pack, quantized
 from tofuse.apps.results import QUALITY, viridis
 from tofuse.engine.arrays import Float32, Float64, Int32, Intp, UInt8, UInt16
-from tofuse.engine.fusion import Cloud, Mesh, Textured, display_colors
+from tofuse.engine.fusion import Cloud, Mesh, Textured, display_colors, drawn
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.images import jpeg_bytes
 
@@ -229,8 +229,7 @@ def _packed_model(scene: Scene, steps: UInt16) -> dict[str, Any]:
         normals, colors, faces = scene.normals, scene.colors, None
     else:
         normals, faces = mesh.normals, pack(mesh.faces.astype("<u4"))
-        color = mesh.color
-        colors = height_colors(mesh.vertices.astype(float)) if color is None else color
+        colors = _mesh_colors(mesh)
     return {
         "points": pack(steps),
         "colors": pack(colors),
@@ -238,6 +237,10 @@ def _packed_model(scene: Scene, steps: UInt16) -> dict[str, Any]:
         "faces": faces,
         **_packed_texture(scene.texture),
     }
+
+
+def _mesh_colors(mesh: Mesh) -> UInt8:
+    return height_colors(mesh.vertices.astype(float)) if mesh.color is None else mesh.color
 
 
 def _packed_texture(texture: Textured | None) -> dict[str, Any]:
@@ -289,7 +292,7 @@ def render(scene: Scene, size: tuple[int, int] = (960, 600), *, yaw: float = YAW
     """Render the initial 3D view, so that it fills an image (H, W, 3), for use without WebGL."""
     import cv2
 
-    points, colors = scene.points, (36 + 0.86 * scene.colors).astype(np.uint8)
+    points = scene.points if scene.mesh is None else scene.mesh.vertices.astype(float)
     framed = points if len(points) else scene.after[:, :3, 3]
     T, scale = thumbnails.framing(framed, size, yaw=yaw, pitch=PITCH)
     R, t = T[:3, :3], T[:3, 3]
@@ -297,21 +300,52 @@ def render(scene: Scene, size: tuple[int, int] = (960, 600), *, yaw: float = YAW
     depth = float(np.ptp(np.percentile(framed @ R[2], [0.2, 99.8]))) if len(framed) else 0.0
     distance = 1.5 * (scene.size + depth)
     lens: Any = {"scale": scale * (1 - 0.5 * depth / distance), "distance": distance}
-    if scene.normals is not None and len(points):
-        # Surfaces that face away are walls in front of the interior.
-        to_eye = -R.T @ (t + np.array([0.0, 0.0, distance])) - points
-        to_eye /= np.linalg.norm(to_eye, axis=1, keepdims=True)
-        facing = (to_eye * np.nan_to_num(scene.normals)).sum(1)
-        colors = (colors * (0.6 + 0.4 * np.abs(facing[:, None]))).astype(np.uint8)
-        points, colors = points[facing >= 0], colors[facing >= 0]
-    radius = int(np.clip(np.ceil(1.5 * scene.spacing * lens["scale"]), 2, 6))
-    rgba = thumbnails.splat(points, colors, T, size, radius=radius, **lens)
-    image = np.where(rgba[..., 3:] > 0, rgba[..., :3], np.array(thumbnails.BACKGROUND, np.uint8))
+    eye = -R.T @ (t + np.array([0.0, 0.0, distance]))
+    image = (_drawn_points if scene.mesh is None else _drawn_surface)(scene, T, eye, size, lens)
     for poses, color in ((scene.before, (240, 160, 60)), (scene.after, (90, 176, 245))):
         pixels, depths = thumbnails.project(poses[:, :3, 3], T, size, **lens)
         path = np.rint(pixels[np.isfinite(depths)]).astype(np.int32)
-        image = cv2.polylines(image, [path], False, color, 2, cv2.LINE_AA)
+        image = np.asarray(cv2.polylines(image, [path], False, color, 2, cv2.LINE_AA), np.uint8)
     return image
+
+
+def _drawn_points(
+    scene: Scene, T: Float64, eye: Float64, size: tuple[int, int], lens: Any
+) -> UInt8:
+    points, colors = scene.points, 36 + 0.86 * scene.colors
+    if scene.normals is not None and len(points):
+        # Surfaces that face away are walls in front of the interior.
+        facing = _cosines(points, scene.normals, eye)
+        colors = colors * (0.6 + 0.4 * np.abs(facing[:, None]))
+        points, colors = points[facing >= 0], colors[facing >= 0]
+    radius = int(np.clip(np.ceil(1.5 * scene.spacing * lens["scale"]), 2, 6))
+    rgba = thumbnails.splat(points, colors.astype(np.uint8), T, size, radius=radius, **lens)
+    return np.where(rgba[..., 3:] > 0, rgba[..., :3], np.array(thumbnails.BACKGROUND, np.uint8))
+
+
+def _drawn_surface(
+    scene: Scene, T: Float64, eye: Float64, size: tuple[int, int], lens: Any
+) -> UInt8:
+    mesh = scene.mesh
+    assert mesh is not None
+    vertices = mesh.vertices.astype(float)
+    light = 0.6 + 0.4 * np.abs(_cosines(vertices, mesh.normals, eye))
+    mesh = replace(mesh, color=(light[:, None] * _mesh_colors(mesh)).astype(np.uint8))
+    corners = vertices[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    pixels, depths = thumbnails.project(vertices, T, size, **lens)
+    shown = (_cosines(corners[:, 0], normals, eye) > 0) & (depths[mesh.faces] > 0).all(1)
+    image, distance = drawn(mesh, pixels, depths, shown, size, scene.texture)
+    background = np.array(thumbnails.BACKGROUND, np.float32)
+    image = np.where(distance[..., None] > 0, 36 + 0.86 * image, background)
+    return np.asarray(image, np.uint8)
+
+
+def _cosines(points: Float64, normals: Float32 | Float64, eye: Float64) -> Float64:
+    """Return (N,) scalar products of unit vectors from points (N, 3) to the eye with normals."""
+    to_eye = eye - points
+    to_eye /= np.maximum(np.linalg.norm(to_eye, axis=1, keepdims=True), 1e-12)
+    return np.asarray((to_eye * np.nan_to_num(normals)).sum(1), np.float64)
 
 
 def extreme_points(points: Float64, outer: float = 2.0) -> Float64:

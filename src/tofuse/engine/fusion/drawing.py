@@ -1,0 +1,77 @@
+"""Images of a surface, as it is seen from somewhere."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from tofuse.engine.arrays import Bool, Float32, Float64
+from tofuse.engine.fusion.atlas_kernels import NO_TRIANGLE, draw_triangles
+from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.fusion.texture import Textured
+
+SAMPLES = 2  # per column and per row of a pixel
+
+
+def drawn(
+    mesh: Mesh,
+    pixels: Float64,
+    depths: Float64,
+    shown: Bool,
+    size: tuple[int, int],
+    texture: Textured | None = None,
+) -> tuple[Float32, Float64]:
+    """Draw a surface with colours or with a texture, from the farthest triangle to the nearest.
+
+    Parameters
+    ----------
+    mesh
+        The surface, with colours; that of `Textured.charts`, however it is placed, for a texture.
+    pixels, depths
+        (V, 2) column and row of the vertices in the image, and (V,) their depths, which are above
+        0 for shown triangles.
+    shown
+        (F,) triangles to draw.
+    size
+        Width and height of the image.
+    texture
+        Whose colours are used instead of those of the vertices.
+
+    Returns
+    -------
+    The image (H, W, 3), 0 to 255, and the depth (H, W), 0 where no triangle covers a whole pixel.
+    """
+    width, height = SAMPLES * size[0], SAMPLES * size[1]
+    corners, depth = (pixels[mesh.faces] + 0.5) * SAMPLES - 0.5, depths[mesh.faces]
+    inside = (corners.max(1) >= 0).all(1) & (corners.min(1) < [width, height]).all(1)
+    order = np.flatnonzero(shown & inside)
+    order = order[np.argsort(-depth[order].mean(1), kind="stable")]
+    owner = np.full((height, width), NO_TRIANGLE, np.int32)
+    place = np.zeros((height, width, 2), np.float32)
+    draw_triangles(corners[order].astype(np.float32), 0.0, owner, place)
+    covered = owner != NO_TRIANGLE
+    faces, (b, c) = order[owner[covered]], place[covered].T
+    weight = np.stack([1 - b - c, b, c], -1) / depth[faces]  # interpolated in perspective
+    far = 1 / weight.sum(-1)
+    weight *= far[:, None]
+    if texture is not None:
+        texel = np.einsum("nk,nki->in", weight, texture.atlas.texels[mesh.faces[faces]])
+        value = _sampled(texture.image, texel.astype(np.float32))
+    else:
+        assert mesh.color is not None
+        value = np.einsum("nk,nki->ni", weight, mesh.color[mesh.faces[faces]].astype(np.float32))
+    samples, distance = np.zeros((height, width, 3), np.float32), np.zeros((height, width))
+    samples[covered], distance[covered] = value, far
+    image = np.asarray(cv2.resize(samples, size, interpolation=cv2.INTER_AREA), np.float32)
+    distance = np.asarray(cv2.resize(distance, size, interpolation=cv2.INTER_AREA), np.float64)
+    whole = covered.reshape(size[1], SAMPLES, size[0], SAMPLES).all((1, 3))
+    return image, np.where(whole, distance, 0.0)
+
+
+def _sampled(image: np.ndarray, at: Float32) -> Float32:
+    """Interpolate an image at (2, N) columns and rows; in blocks, as OpenCV limits their length."""
+    count, side = at.shape[1], 16_384
+    rows = -(-count // side)
+    u, v = (np.pad(x, (0, rows * side - count)).reshape(rows, side) for x in at)
+    sampled = cv2.remap(image, u, v, cv2.INTER_LINEAR).reshape(-1, 3)
+    return np.asarray(sampled[:count], np.float32)
