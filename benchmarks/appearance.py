@@ -33,7 +33,7 @@ from scipy.optimize import least_squares
 from tofuse.apps.jobs import Options, run
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.frames import RangeFrame, Recording
-from tofuse.engine.fusion import Mesh, Textured, display_colors, drawn
+from tofuse.engine.fusion import Mesh, Textured, drawing
 from tofuse.engine.fusion.display_surface import TOLERANCE_FRACTION, TOLERANCE_M
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import texturing
@@ -287,10 +287,10 @@ def rendered(
         size[1] / camera.height,
     ] - 0.5
     assert mesh.color is not None
-    mesh = replace(mesh, color=display_colors(mesh.color))
-    texture = model if isinstance(model, Textured) else None
+    mesh = replace(mesh, color=drawing.display_colors(mesh.color))
+    texture = (model.atlas.texels, model.image) if isinstance(model, Textured) else None
     shown = (p[mesh.faces, 2] > _NEAREST).all(1)
-    return drawn(mesh, pixels, p[:, 2], shown, size, texture)
+    return drawing.drawn(mesh, pixels, p[:, 2], shown, size, texture)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,8 @@ from tofuse.apps.report.subject import Subject
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.engine.fusion.cloud import Cloud, display_colors, empty_cloud
+from tofuse.engine.fusion.cloud import Cloud, empty_cloud
+from tofuse.engine.fusion.drawing import display_colors
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.pose_errors import UNKNOWN_M
 from tofuse.engine.geometry import se3

@@ -18,7 +18,7 @@ from tofuse.apps.export.posed_frames import PosedFrame
 from tofuse.apps.export.scene import Scene
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
-from tofuse.engine.fusion import GeometryRecord, display_colors
+from tofuse.engine.fusion import GeometryRecord, drawing
 from tofuse.engine.geometry import quaternion
 from tofuse.formats.files import atomic, reading
 from tofuse.formats.images import jpeg_bytes
@@ -126,7 +126,7 @@ def _points(cloud: GeometryRecord) -> Any:
         columns["sigma"] = sigma
         types.append(("sigma", "<f4"))
     if cloud.color is not None:
-        rgb = display_colors(cloud.color)
+        rgb = drawing.display_colors(cloud.color)
         columns |= dict(zip(("red", "green", "blue"), rgb.T, strict=True))
         columns["alpha"] = np.full(len(cloud), 255, np.uint8)
         types += [(name, "u1") for name in ("red", "green", "blue", "alpha")]

@@ -11,7 +11,7 @@ from tofuse.apps.export.scene import Scene
 from tofuse.apps.results import viridis
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import Pinhole
-from tofuse.engine.fusion import display_colors
+from tofuse.engine.fusion import drawing
 from tofuse.engine.geometry import quaternion
 from tofuse.formats.files import atomic, reading
 from tofuse.formats.images import jpeg_bytes
@@ -65,7 +65,7 @@ def _log_model(rr: Any, recording: Any, scene: Scene) -> None:
             vertex_positions=mesh.points,
             triangle_indices=mesh.faces,
             vertex_normals=mesh.normals,
-            vertex_colors=None if mesh.color is None else display_colors(mesh.color),
+            vertex_colors=None if mesh.color is None else drawing.display_colors(mesh.color),
         )
         recording.log("world/mesh", surface, static=True)
     path = rr.LineStrips3D([scene.poses[:, :3, 3]], colors=[_PATH_COLOR])

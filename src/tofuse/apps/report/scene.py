@@ -13,7 +13,7 @@ from tofuse.apps.report import thumbnails
 from tofuse.apps.report.packing import normal_bytes, pack, quantized
 from tofuse.apps.results import QUALITY, viridis
 from tofuse.engine.arrays import Float32, Float64, Int32, Intp, UInt8, UInt16
-from tofuse.engine.fusion import Cloud, Mesh, Textured, display_colors, drawn
+from tofuse.engine.fusion import Cloud, Mesh, Textured, drawing
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.images import jpeg_bytes
 
@@ -258,7 +258,7 @@ def _packed_texture(texture: Textured | None) -> dict[str, Any]:
 def _display_colors(mesh: Mesh | None) -> Mesh | None:
     if mesh is None or mesh.color is None:
         return mesh
-    return replace(mesh, color=display_colors(mesh.color))
+    return replace(mesh, color=drawing.display_colors(mesh.color))
 
 
 def opening_yaw(scene: Scene) -> float:
@@ -335,7 +335,9 @@ def _drawn_surface(
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     pixels, depths = thumbnails.project(vertices, T, size, **lens)
     shown = (_cosines(corners[:, 0], normals, eye) > 0) & (depths[mesh.faces] > 0).all(1)
-    image, distance = drawn(mesh, pixels, depths, shown, size, scene.texture)
+    t = scene.texture
+    texture = None if t is None else (t.atlas.texels, t.image)
+    image, distance = drawing.drawn(mesh, pixels, depths, shown, size, texture)
     background = np.array(thumbnails.BACKGROUND, np.float32)
     image = np.where(distance[..., None] > 0, 36 + 0.86 * image, background)
     return np.asarray(image, np.uint8)
@@ -378,7 +380,7 @@ def random_subset(count: int, max_count: int) -> Intp:
 
 def _colors(cloud: Cloud, sampled: Intp, points: Float64) -> UInt8:
     if cloud.color is not None:
-        return display_colors(cloud.color[sampled])
+        return drawing.display_colors(cloud.color[sampled])
     return height_colors(points)
 
 

@@ -15,7 +15,7 @@ from tofuse.apps.results.folders import OutputFolder, component_name
 from tofuse.apps.results.run_json import write_run_json
 from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.compute import job_pool
-from tofuse.engine.fusion import GeometryRecord, Mesh, Textured, display_colors, texture
+from tofuse.engine.fusion import GeometryRecord, Mesh, Textured, drawing, texture
 from tofuse.engine.geometry import se3
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.stopwatch import timing
@@ -126,7 +126,7 @@ def _without_black(record: GeometryRecord) -> GeometryRecord:
     """
     if record.color is None or (record.color == record.color[:, :1]).all():
         return record
-    return replace(record, color=display_colors(record.color))
+    return replace(record, color=drawing.display_colors(record.color))
 
 
 def _write_changes(result: Reconstruction, path: Path) -> None:
@@ -155,7 +155,7 @@ def _write_scene(mesh: Mesh, T_up_world: Float64, folder: Path, texture: Texture
                 displayed.vertices,
                 displayed.faces,
                 normals=displayed.normals,
-                color=None if displayed.color is None else display_colors(displayed.color),
+                color=None if displayed.color is None else drawing.display_colors(displayed.color),
             ),
             **node,
         )

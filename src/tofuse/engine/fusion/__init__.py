@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.fusion import display_surface, occupancy, texture
-    from tofuse.engine.fusion.cloud import Cloud, as_cloud, display_colors
-    from tofuse.engine.fusion.drawing import drawn
+    from tofuse.engine.fusion import display_surface, drawing, occupancy, texture
+    from tofuse.engine.fusion.cloud import Cloud, as_cloud
     from tofuse.engine.fusion.geometry_record import GeometryRecord
     from tofuse.engine.fusion.mesh import Mesh
     from tofuse.engine.fusion.model import Model, ModelBuilder

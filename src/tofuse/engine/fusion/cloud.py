@@ -27,13 +27,6 @@ def has_color(colors: UInt8) -> Bool:
     return np.asarray(colors.any(1) & (colors != np.array(NO_COLOR, np.uint8)).any(1), np.bool_)
 
 
-def display_colors(colors: UInt8) -> UInt8:
-    """Return colours (N, 3) with a neutral grey for unknown ones."""
-    shown = colors.copy()
-    shown[~has_color(colors)] = NO_COLOR
-    return shown
-
-
 _BUFFER_ROWS = 2_000_000
 _NORMAL_NEIGHBOURS = 12  # points in the plane fit of a normal
 _KEY_BITS = 21  # voxels per axis: 2^21, that is 21 km at 1 cm

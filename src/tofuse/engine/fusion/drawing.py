@@ -1,16 +1,23 @@
-"""Images of a surface, as it is seen from somewhere."""
+"""Colours for the eye, and images of a surface as it is seen from somewhere."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-from tofuse.engine.arrays import Bool, Float32, Float64
+from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
 from tofuse.engine.fusion.atlas_kernels import NO_TRIANGLE, draw_triangles
+from tofuse.engine.fusion.cloud import NO_COLOR, has_color
 from tofuse.engine.fusion.mesh import Mesh
-from tofuse.engine.fusion.texture import Textured
 
 SAMPLES = 2  # per column and per row of a pixel
+
+
+def display_colors(colors: UInt8) -> UInt8:
+    """Return colours (N, 3) with a neutral grey for unknown ones."""
+    shown = colors.copy()
+    shown[~has_color(colors)] = NO_COLOR
+    return shown
 
 
 def drawn(
@@ -19,14 +26,14 @@ def drawn(
     depths: Float64,
     shown: Bool,
     size: tuple[int, int],
-    texture: Textured | None = None,
+    texture: tuple[Float32, UInt8] | None = None,
 ) -> tuple[Float32, Float64]:
     """Draw a surface with colours or with a texture, from the farthest triangle to the nearest.
 
     Parameters
     ----------
     mesh
-        The surface, with colours; that of `Textured.charts`, however it is placed, for a texture.
+        The surface.
     pixels, depths
         (V, 2) column and row of the vertices in the image, and (V,) their depths, which are above
         0 for shown triangles.
@@ -35,7 +42,8 @@ def drawn(
     size
         Width and height of the image.
     texture
-        Whose colours are used instead of those of the vertices.
+        Used instead of the colours of the vertices: their columns and rows (V, 2) in an image
+        (H, W, 3).
 
     Returns
     -------
@@ -55,8 +63,8 @@ def drawn(
     far = 1 / weight.sum(-1)
     weight *= far[:, None]
     if texture is not None:
-        texel = np.einsum("nk,nki->in", weight, texture.atlas.texels[mesh.faces[faces]])
-        value = _sampled(texture.image, texel.astype(np.float32))
+        texel = np.einsum("nk,nki->in", weight, texture[0][mesh.faces[faces]])
+        value = _sampled(texture[1], texel.astype(np.float32))
     else:
         assert mesh.color is not None
         value = np.einsum("nk,nki->ni", weight, mesh.color[mesh.faces[faces]].astype(np.float32))

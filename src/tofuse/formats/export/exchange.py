@@ -11,7 +11,7 @@ import numpy as np
 from tofuse._version import __version__
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.fusion import GeometryRecord, display_colors
+from tofuse.engine.fusion import GeometryRecord, drawing
 from tofuse.formats.files import atomic, reading
 from tofuse.formats.geometry import (
     write_e57,
@@ -103,7 +103,9 @@ def _for_display(mesh: GeometryRecord, R: Float64) -> GeometryRecord:
         mesh.points @ R.T,
         mesh.faces,
         None if mesh.normals is None else mesh.normals @ R.T,
-        None if mesh.color is None or mesh.texture is not None else display_colors(mesh.color),
+        None
+        if mesh.color is None or mesh.texture is not None
+        else drawing.display_colors(mesh.color),
         mesh.uv,
         mesh.texture,
     )
