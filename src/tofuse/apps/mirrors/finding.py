@@ -70,8 +70,7 @@ def _weighed(
     first = weigh(opening, views[::step], points, normals, noise, compare=False)
     if not opening.whole or (step > 1 and first.patches and first.share < _PROMISING):
         return first
-    evidence = weigh(opening, views, points, normals, noise)
-    return replace(evidence, log_ratio=evidence.log_ratio + opening.thinness(views, noise))
+    return weigh(opening, views, points, normals, noise)
 
 
 def _mirrors_in(weighed: Sequence[tuple[Opening, Evidence]]) -> list[_Found]:

@@ -23,10 +23,6 @@ _RAYS, _MIN_INCIDENCE = 6000, 0.08
 _MIN_CELLS, _MIN_RAYS, _MIN_CONVEXITY, _MIN_FRAME = 12, 3, 0.7, 0.3
 _WHOLE_CONVEXITY, _WHOLE_FRAME = 0.78, 0.8
 _RING_M = 0.2  # of the surface around an opening
-# Walls, shelves and cupboards are at least so thick, but for this share of all openings.
-_THICK_M, _THIN = 0.08, 0.01
-# Pieces of an outline whose rays decide together: their length, fewest rays, how often they err.
-_PIECE_M, _MIN_ON_PIECE, _ERR = 0.2, 5, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,17 +85,14 @@ class Opening:
     Attributes
     ----------
     outline
-        (K, 2) corners in the axes of the plane, counter-clockwise, m.
+        (K, 2) corners in the axes of the plane, m.
     whole
         Whether it is convex and surrounded by surface; else it may be a part of an opening.
-    cell_m
-        The outline is not known better than this.
     """
 
     plane: Plane
     outline: Float64
     whole: bool
-    cell_m: float
 
     @property
     def area_m2(self) -> float:
@@ -113,47 +106,13 @@ class Opening:
 
     def contains(self, points: Float64) -> Bool:
         """Whether points (N, 3) of the plane are within the outline."""
-        return np.asarray((self._within(points @ self.plane.axes.T) >= 0).all(1), np.bool_)
-
-    @property
-    def _inward(self) -> Float64:
-        """(K, 2) unit normals of the sides."""
+        flat = points @ self.plane.axes.T
         ahead = np.roll(self.outline, -1, axis=0) - self.outline
-        return np.c_[-ahead[:, 1], ahead[:, 0]] / np.linalg.norm(ahead, axis=1, keepdims=True)
-
-    def _within(self, flat: Float64) -> Float64:
-        """(N, K) how far points (N, 2) in the plane are within each side."""
-        n = self._inward
-        return flat @ n.T - (self.outline * n).sum(1)
-
-    def thinness(self, views: Sequence[View], noise: Noise) -> float:
-        """Logarithm of the likelihood ratio of a mirror to a hole, by what is seen at its edge.
-
-        Rays that pass a hole near its edge meet the thickness of the wall; a mirror has none.
-        """
-        places, passed = [], []
-        margin = 2 * noise.tolerance_m
-        for view in views:
-            if not self.seen_by(view, 2 * margin):
-                continue
-            q, along, _, depth = _arrivals(view, self.plane)
-            within, nearer = self._within(q), -along @ self._inward.T
-            # Of a straight hole's sides the ray meets this one first, so deep behind the plane.
-            deep = np.where(nearer > 0, within / np.where(nearer > 0, nearer, 1), np.inf).min(1)
-            used = (within > self.cell_m).all(1) & (deep < _THICK_M)
-            used &= (depth > -margin) & np.isfinite(depth)
-            places.append((q + deep[:, None] * along)[used])
-            passed.append(depth[used] > _THICK_M + margin)
-        if not sum(map(len, places)):
-            return 0.0
-        cells = np.floor(np.concatenate(places) / _PIECE_M)
-        _, piece, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-        share = np.bincount(piece.ravel(), np.concatenate(passed)) / count
-        decided = share[count >= _MIN_ON_PIECE] > 0.5
-        against = len(decided) - 2 * int(decided.sum())
-        return -float(
-            np.logaddexp(np.log1p(-_THIN) + against * np.log(1 / _ERR - 1), np.log(_THIN))
-        )
+        sides = [
+            e[0] * (flat[:, 1] - p[1]) - e[1] * (flat[:, 0] - p[0])
+            for p, e in zip(self.outline, ahead, strict=True)
+        ]
+        return np.all(np.array(sides) >= 0, axis=0) | np.all(np.array(sides) <= 0, axis=0)
 
     def behind(self, points: Float64, origins: Float64) -> Bool:
         """Whether each point (N, 3) is seen through the opening from one of the origins (M, 3)."""
@@ -193,30 +152,6 @@ class Opening:
         return replace(self, outline=_hull((self.outline[:, None] + circle).reshape(-1, 2)))
 
 
-def _arrivals(view: View, plane: Plane) -> tuple[Float64, Float64, Float64, Float64]:
-    """Return what rays of a view meet in and behind a plane.
-
-    Returns
-    -------
-    Where they cross it (N, 2), in its axes; how far they go along it for each metre behind it
-    (N, 2); after which distance they cross it (N,); and how deep behind it they end (N,), inf where
-    nothing returns.
-    """
-    step = max(1, int(np.sqrt(view.ranges.size / _RAYS)))
-    measured = view.ranges[::step, ::step].ravel()
-    xy = view.camera.rays()[::step, ::step].reshape(-1, 2).astype(float)
-    rays = np.c_[xy, np.ones(len(xy))]
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    rays = rays @ view.T_world_camera[:3, :3].T
-    reached = plane.crossings(view.origin, rays)
-    used = np.isfinite(reached)
-    rays, reached, measured = rays[used], reached[used], measured[used]
-    slope = -(rays @ plane.normal)
-    depth = np.where(measured > 0, (measured - reached) * slope, np.inf)
-    q = view.origin + reached[:, None] * rays
-    return q @ plane.axes.T, rays @ plane.axes.T / slope[:, None], reached, depth
-
-
 def _hull(points: Float64) -> Float64:
     """Corners (K, 2) of the convex hull of points (N, 2)."""
     return np.asarray(cv2.convexHull(points.astype(np.float32))[:, 0], np.float64)
@@ -229,9 +164,19 @@ def find_openings(plane: Plane, views: Sequence[View], noise: Noise) -> list[Ope
     for view in views:
         if plane.height(view.origin) < 2 * margin:
             continue
-        q, _, reached, depth = _arrivals(view, plane)
-        used = depth > -margin
-        places.append(q[used])
+        step = max(1, int(np.sqrt(view.ranges.size / _RAYS)))
+        measured = view.ranges[::step, ::step].ravel()
+        xy = view.camera.rays()[::step, ::step].reshape(-1, 2).astype(float)
+        rays = np.c_[xy, np.ones(len(xy))]
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        rays = rays @ view.T_world_camera[:3, :3].T
+        reached = plane.crossings(view.origin, rays)
+        depth = (measured - reached) * np.abs(rays @ plane.normal)
+        # Where nothing returns, the plane is no surface either.
+        depth[measured <= 0] = np.inf
+        used = np.isfinite(reached) & (depth > -margin)
+        q = view.origin + reached[used, None] * rays[used]
+        places.append(q @ plane.axes.T)
         passed.append(depth[used] > margin)
         pitches.append(np.median(reached[used]) if used.any() else np.nan)
     if not places or not sum(map(len, places)):
@@ -290,5 +235,5 @@ def _regions(
         if convexity < _MIN_CONVEXITY or framed < _MIN_FRAME:
             continue
         whole = convexity > _WHOLE_CONVEXITY and framed > _WHOLE_FRAME
-        openings.append(Opening(plane, low + cell * hull, whole, cell))
+        openings.append(Opening(plane, low + cell * hull, whole))
     return openings
