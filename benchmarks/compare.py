@@ -234,9 +234,9 @@ def recorded(data: Path) -> None:
     print("|---|---|---|---|---|---|")
     tags = tofuse.open(data / "azure_kinect_tags").select(every=4)
     corners = np.array([*lengths.true_corners(tags).values()])
-    plane, off = _plane_through(corners)
-    result = tofuse.reconstruct(tags)
     assert tags.reference is not None
+    plane, off = _plane_through(corners, tags.reference[0, :3, 3])
+    result = tofuse.reconstruct(tags)
     guess = align(result.trajectory, tags.reference)
     _row("azure_kinect_tags, plane", tofuse.compare(result, plane, guess=guess))
     room = tofuse.open(data / "iphone_room")
@@ -251,16 +251,15 @@ def recorded(data: Path) -> None:
     print(f"The camera moved by {np.round(1e3 * T[:3, 3]).astype(int)} mm in the corridor.")
 
 
-def _plane_through(points: Float64) -> tuple[tofuse.Mesh, float]:
-    """Return a rectangle through points (N, 3), and their rms distance from it."""
+def _plane_through(points: Float64, eye: Float64) -> tuple[tofuse.Mesh, float]:
+    """Return a rectangle through points (N, 3), facing an eye, and their rms distance from it."""
     centre = points.mean(0)
     _, scatter, axes = np.linalg.svd(points - centre, full_matrices=False)
     flat = (points - centre) @ axes[:2].T
     (a, b), (c, d) = flat.min(0), flat.max(0)
     vertices = (np.array([(a, b), (c, b), (c, d), (a, d)]) @ axes[:2] + centre).astype(np.float32)
-    # It faces the cameras, which are at the origin.
     faces = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
-    if np.cross(vertices[1] - vertices[0], vertices[2] - vertices[0]) @ centre > 0:
+    if np.cross(vertices[1] - vertices[0], vertices[2] - vertices[0]) @ (eye - centre) < 0:
         faces = faces[:, ::-1].copy()
     zeros = np.zeros(4, np.float32)
     mesh = tofuse.Mesh(vertices, faces, np.zeros((4, 3), np.float32), None, zeros, np.ones(4, int))
