@@ -1,29 +1,37 @@
 """Does a camera card find a drift of the camera, and does it warn without one?
 
     python benchmarks/card.py [seeds]
+    python benchmarks/card.py --picture docs/images/card.png
 
 A pool of short sessions is simulated (80 x 60 pixels, 48 frames; each seed once in a room and
 once in a flat, with another motion and noise) and reconstructed four times: as they are, with a
 camera that states a focal length 1 % too long, with ranges 5 mm too long, and with 1.5 times the
 noise. A campaign is a number of sessions drawn from the pool; a drift begins after half of them.
 Prints the scatter of the sessions in units of their sigmas, the share of campaigns in which the
-card warns, and the change of the ranges that it says it would find (median of the campaigns).
+card warns, and the change of the ranges that it says it would find (median of the campaigns). The
+picture is the top of the card of a campaign whose values are drawn with these sigmas and scatter.
 """
 
 from __future__ import annotations
 
+import argparse
+import shutil
 import sys
+import tempfile
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+from playwright.sync_api import sync_playwright
 
 import situations
 import stress
 import tofuse
-from tofuse.apps.card.collecting import values_of
+from tofuse.apps.card.collecting import Identity, Session, values_of
 from tofuse.apps.card.drift import drift_of, holm
-from tofuse.apps.card.making import QUANTITIES, SIGNIFICANCE
+from tofuse.apps.card.making import QUANTITIES, SIGNIFICANCE, card_of
+from tofuse.apps.card.page import write_page
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.lab.simulation.models import noise_of
 from variants import Take
@@ -49,7 +57,14 @@ def noisier(frame: RangeFrame, factor: float) -> RangeFrame:
 
 
 def main() -> None:
-    seeds = int(sys.argv[1]) if len(sys.argv) > 1 else 12
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("seeds", type=int, nargs="?", default=12)
+    parser.add_argument("--picture", type=Path, help="only draw this picture")
+    options = parser.parse_args()
+    if options.picture is not None:
+        draw(options.picture)
+        return
+    seeds = options.seeds
     pool = pool_of(seeds)
     print(f"{len(pool)} sessions\n")
     print("| quantity | sigma (median) | scatter (in sigmas) |\n|---|---|---|")
@@ -118,6 +133,30 @@ def detectable(pool: list[dict[str, Values]], size: int) -> float:
         if len(rows) > 3:
             limits.append(drift_of(*rows.T, trend=True).detectable(len(QUANTITIES)))
     return float(np.median(limits)) if limits else np.nan
+
+
+def draw(path: Path) -> None:
+    """Draw the card of a camera whose focal length changes by 1 % after half of 16 sessions."""
+    rng = np.random.default_rng(0)
+    truth = {"focal": (69.3, 0.11), "offset": (0.0, 0.0045), "center_x": (39.5, 0.04)}
+    sessions = []
+    for k in range(16):
+        values = {
+            name: (value * (1.01 if name == "focal" and k > 7 else 1) + 1.8 * sigma * error, sigma)
+            for (name, (value, sigma)), error in zip(truth.items(), rng.normal(size=3), strict=True)
+        }
+        sessions.append(
+            Session(f"scan{k + 1:02}/result", 86400 * (19_800 + 25 * k), False, values, None)
+        )
+    card = card_of(Identity("ifm O3R (ToF)", "17", (80, 60)), sessions)
+    chromium = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        write_page(card, Path(folder) / "card.html")
+        browser = playwright.chromium.launch(executable_path=chromium)
+        page = browser.new_page(viewport={"width": 900, "height": 720})
+        page.goto((Path(folder) / "card.html").as_uri())
+        page.screenshot(path=path)
+        browser.close()
 
 
 if __name__ == "__main__":

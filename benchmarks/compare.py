@@ -1,12 +1,14 @@
 """Verdicts of `tofuse compare` and components of `tofuse repeat`, on parts with known deviations.
 
-    python benchmarks/compare.py [--parts 200] [--picture docs/images/compare.png]
+    python benchmarks/compare.py [--parts 300] [--first SEED] [--picture docs/images/compare.png]
+    python benchmarks/compare.py --data ../shared/data
 
 Each part is a plate with two blocks of random sizes, sampled as a fused scan is: from a number of
 views around it, each with noise and with an error of its pose, so that the surface has errors that
 neighbouring places share. It is as drawn, or has a bump, a shifted face, a bent plate or another
 scale. True is the largest deviation of the noise-free surface after the same best fit,
-at what the views see.
+at what the views see. With `--data`, real recordings are compared with each other, and with the
+plane on which tags lie.
 """
 
 from __future__ import annotations
@@ -18,6 +20,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+import lengths
+import tofuse
 from tofuse.apps.compare.comparing import Comparison, compared
 from tofuse.apps.compare.nearest import Reach, Reference
 from tofuse.apps.compare.page import compare_scene
@@ -25,6 +29,7 @@ from tofuse.apps.compare.repeating import Session, repeated
 from tofuse.apps.compare.surface import Surface
 from tofuse.apps.report import scene
 from tofuse.engine.arrays import Float64
+from tofuse.engine.quality.trajectory_errors import align
 from tofuse.lab.world import mesh as meshes
 
 TOLERANCE_M = 0.002
@@ -121,10 +126,10 @@ def sampled(reference: Reference, count: int, rng: np.random.Generator) -> tuple
     return points[~inside], normals[~inside]
 
 
-def verdicts(parts: int) -> None:
+def verdicts(parts: int, first: int) -> None:
     """Print verdicts by the true deviation and the number of views."""
     rows = []
-    for k in range(parts):
+    for k in range(first, first + parts):
         rng = np.random.default_rng([1, k])
         kind = KINDS[k % len(KINDS)]
         size = 0.0 if kind == "as drawn" else rng.uniform(0, 2.5) * TOLERANCE_M
@@ -146,10 +151,10 @@ def verdicts(parts: int) -> None:
         )
 
 
-def detection(parts: int) -> None:
+def detection(parts: int, first: int) -> None:
     """Print how often nothing seems to change, and how often a change of the limit is seen."""
     calm = found = 0
-    for k in range(parts):
+    for k in range(first, first + parts):
         rng = np.random.default_rng([3, k])
         part = Part.made(rng, "as drawn", 0.0)
         first, _ = part.compared(12, [4, k])
@@ -170,10 +175,10 @@ def detection(parts: int) -> None:
     print(f"changes of the detection limit that are significant: {found} of {parts}")
 
 
-def repetitions(studies: int) -> None:
+def repetitions(studies: int, first: int) -> None:
     """Print variance components of repeated scans, relative to the true ones."""
     ratios = []
-    for k in range(studies):
+    for k in range(first, first + studies):
         rng = np.random.default_rng([6, k])
         part = Part.made(rng, "as drawn", 0.0)
         sessions = []
@@ -218,6 +223,60 @@ def smooth(part: Part, rng: np.random.Generator, waves: int = 40) -> Float64:
     return field / float(np.sqrt((field**2).mean()))
 
 
+def recorded(data: Path) -> None:
+    """Print what differs in real recordings in which nothing does.
+
+    The table of `azure_kinect_tags` from the plane through its tags' corners, which its colour
+    images and true poses give; two clips of `iphone_room`, every other frame each; and the two
+    positions of `sr4000_corridor`, of which nothing but the images says how far apart they are.
+    """
+    print("| recording | places | of size, mm | differ (median), mm | not significant | seen |")
+    print("|---|---|---|---|---|---|")
+    tags = tofuse.open(data / "azure_kinect_tags").select(every=4)
+    corners = np.array([*lengths.true_corners(tags).values()])
+    assert tags.reference is not None
+    plane, off = _plane_through(corners, tags.reference[0, :3, 3])
+    result = tofuse.reconstruct(tags)
+    guess = align(result.trajectory, tags.reference)
+    _row("azure_kinect_tags, plane", tofuse.compare(result, plane, guess=guess))
+    room = tofuse.open(data / "iphone_room")
+    clips = [tofuse.reconstruct(room.select(start=k, every=2)) for k in range(2)]
+    _row("iphone_room, two clips", tofuse.compare(clips[1], clips[0]))
+    stands = [tofuse.open(data / "sr4000_corridor" / name) for name in ("Y1", "Y2")]
+    first, second = (tofuse.reconstruct(stand) for stand in stands)
+    found = tofuse.compare(second, first)
+    _row("sr4000_corridor, two positions", found)
+    print(f"The tags' {len(corners)} corners are off their plane by {1e3 * off:.2f} mm (rms).")
+    T = found.deviations.T_reference_measured
+    print(f"The camera moved by {np.round(1e3 * T[:3, 3]).astype(int)} mm in the corridor.")
+
+
+def _plane_through(points: Float64, eye: Float64) -> tuple[tofuse.Mesh, float]:
+    """Return a rectangle through points (N, 3), facing an eye, and their rms distance from it."""
+    centre = points.mean(0)
+    _, scatter, axes = np.linalg.svd(points - centre, full_matrices=False)
+    flat = (points - centre) @ axes[:2].T
+    (a, b), (c, d) = flat.min(0), flat.max(0)
+    vertices = (np.array([(a, b), (c, b), (c, d), (a, d)]) @ axes[:2] + centre).astype(np.float32)
+    faces = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
+    if np.cross(vertices[1] - vertices[0], vertices[2] - vertices[0]) @ (eye - centre) < 0:
+        faces = faces[:, ::-1].copy()
+    zeros = np.zeros(4, np.float32)
+    mesh = tofuse.Mesh(vertices, faces, np.zeros((4, 3), np.float32), None, zeros, np.ones(4, int))
+    return mesh, float(scatter[2] / np.sqrt(len(points)))
+
+
+def _row(name: str, found: Comparison) -> None:
+    places = found.deviations.places
+    inside = np.abs(places.deviation) <= 1.96 * places.sigma
+    print(
+        f"| {name} | {len(inside)} | {1e3 * places.size:.0f} | "
+        f"{1e3 * np.median(np.abs(places.deviation)):.1f} | {inside.mean():.0%} | "
+        f"{found.seen:.0%} |\n{found.sentence}",
+        flush=True,
+    )
+
+
 def draw(path: Path) -> None:
     """Write a picture of a part with a bump."""
     rng = np.random.default_rng([1, 6])
@@ -229,16 +288,21 @@ def draw(path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--parts", type=int, default=200)
+    parser.add_argument("--parts", type=int, default=300)
+    parser.add_argument("--first", type=int, default=1000, help="seed of the first part")
+    parser.add_argument("--data", type=Path, help="compare the real recordings of this folder")
     parser.add_argument("--picture", type=Path, help="only write this picture")
     arguments = parser.parse_args()
     parts = arguments.parts
     if arguments.picture is not None:
         draw(arguments.picture)
         return
-    repetitions(max(parts // 100, 1))
-    detection(max(parts // 4, 1))
-    verdicts(parts)
+    if arguments.data is not None:
+        recorded(arguments.data)
+        return
+    repetitions(max(parts // 100, 1), arguments.first)
+    detection(max(parts // 4, 1), arguments.first)
+    verdicts(parts, arguments.first)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ true places are triangulated from the colour images at the poses of a bundle adj
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import repeat
 from pathlib import Path
@@ -285,27 +285,18 @@ def recorded(folder: Path, every: int) -> None:
     """Print the row of the tags, of all pairs of their corners."""
     recording = open_recording(folder).select(every=every)
     result = reconstruct(recording)
-    assert recording.reference is not None
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(TAGS))
-    rays: dict[tuple[int, int], list[tuple[Float64, Float64]]] = {}
+    true_of = true_corners(recording)
     tapped: dict[tuple[int, int], list[Float64]] = {}
-    poses = zip(recording, recording.reference, result.trajectory, strict=True)
-    for frame, T_true, T in poses:
+    for frame, T in zip(recording, result.trajectory, strict=True):
         assert isinstance(frame, RangeFrame)
-        assert frame.color_image is not None
-        found, ids, _ = detector.detectMarkers(frame.color_image)
-        for of_tag, tag in zip(found, [] if ids is None else ids.ravel().tolist(), strict=True):
-            for k, (x, y) in enumerate(of_tag[0].astype(float)):
-                u, v = round(x), round(y)
-                z = frame.z[v - 2 : v + 3, u - 2 : u + 3]
-                ray = cv2.remap(frame.camera.rays(), np.float32([[x]]), np.float32([[y]]), 1)[0, 0]
-                direction = T_true[:3, :3] @ np.append(ray.astype(float), 1.0)
-                rays.setdefault((tag, k), []).append((T_true[:3, 3], direction))
-                if z.size == 25 and (z > 0).all():
-                    place = np.append(ray.astype(float), 1.0) * np.median(z)
-                    tapped.setdefault((tag, k), []).append(se3.transform(T, place[None])[0])
-    corners = [key for key in rays if len(rays[key]) > len(recording) / 2 and key in tapped]
-    true = np.array([_nearest(rays[key]) for key in corners])
+        for key, (x, y), ray in _corners(frame):
+            u, v = round(x), round(y)
+            z = frame.z[v - 2 : v + 3, u - 2 : u + 3]
+            if z.size == 25 and (z > 0).all():
+                place = ray * np.median(z)
+                tapped.setdefault(key, []).append(se3.transform(T, place[None])[0])
+    corners = [key for key in true_of if key in tapped]
+    true = np.array([true_of[key] for key in corners])
     places = np.array([np.mean(tapped[key], axis=0) for key in corners])
     errors = LengthErrors.of(result, recording.first_readable())
     assert errors is not None
@@ -319,6 +310,28 @@ def recorded(folder: Path, every: int) -> None:
     print("|---|---|---|---|---|---|---|")
     bounds = np.array([one.bound_m for one in lengths])
     print(f"| azure_kinect_tags | {Measured(found_m - truth, bounds).cells()} |")
+
+
+def true_corners(recording: Recording) -> dict[tuple[int, int], Float64]:
+    """Return the corners of tags that most colour images show, by the true poses: (3,) each."""
+    assert recording.reference is not None
+    rays: dict[tuple[int, int], list[tuple[Float64, Float64]]] = {}
+    for frame, T in zip(recording, recording.reference, strict=True):
+        assert isinstance(frame, RangeFrame)
+        for key, _, ray in _corners(frame):
+            rays.setdefault(key, []).append((T[:3, 3], T[:3, :3] @ ray))
+    return {key: _nearest(lines) for key, lines in rays.items() if len(lines) > len(recording) / 2}
+
+
+def _corners(frame: RangeFrame) -> Iterator[tuple[tuple[int, int], Float64, Float64]]:
+    """Yield tag and number, pixel (2,) and ray (3,) of each corner of a tag in a colour image."""
+    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(TAGS))
+    assert frame.color_image is not None
+    found, ids, _ = detector.detectMarkers(frame.color_image)
+    for of_tag, tag in zip(found, [] if ids is None else ids.ravel().tolist(), strict=True):
+        for k, pixel in enumerate(of_tag[0].astype(float)):
+            xy = cv2.remap(frame.camera.rays(), *np.float32(pixel)[:, None, None], 1)[0, 0]
+            yield (tag, k), pixel, np.append(xy.astype(float), 1.0)
 
 
 def _nearest(lines: Sequence[tuple[Float64, Float64]]) -> Float64:

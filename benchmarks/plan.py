@@ -2,8 +2,8 @@
 
 A small camera (80 x 60 pixels) scans a room. From its result `tofuse plan` predicts the bound and
 the coverage of other cameras along the same path. They are then simulated in the true room, at full
-resolution, along the true path, and reconstructed. Both with several seeds of the noise, of which
-the medians are compared, and all bounds are listed.
+resolution, along the true path, and reconstructed. With `--repeats`, both are done with several
+seeds of the noise, all bounds are listed, and their medians are compared.
 
     python benchmarks/plan.py [--names room] [--cameras ifm-o3r pico-flexx] [--all-effects]
 """
@@ -63,7 +63,7 @@ def main() -> None:
     parser.add_argument("--names", nargs="+", default=[""], help="rooms whose names contain these")
     parser.add_argument("--cameras", nargs="+", default=["ifm-o3r", "pico-flexx", "sr4000"])
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--repeats", type=int, default=3, help="seeds of the noise")
+    parser.add_argument("--repeats", type=int, default=1, help="seeds of the noise")
     parser.add_argument(
         "--all-effects", action="store_true", help="with multipath and smear, which take longer"
     )

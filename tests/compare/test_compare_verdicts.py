@@ -9,6 +9,7 @@ import pytest
 
 import tofuse
 from measured_parts import NOISE, drawn, scan
+from tofuse.apps.compare import deviations as module
 from tofuse.apps.compare.comparing import compared
 from tofuse.apps.compare.deviations import COVERAGE
 from tofuse.apps.compare.nearest import Reach, Reference
@@ -145,3 +146,13 @@ def test_surfaces_that_don_t_overlap_are_refused(part) -> None:
     far = moved(scan(part), se3.translation(np.array([0, 0, 5.0])))
     with pytest.raises(InputError, match="no surface within"):
         compared(far, part, 0.002, searched=False)
+
+
+def test_places_without_bound_have_no_slope() -> None:
+    """Three in a row and one of another region, which has no neighbours there."""
+    places = np.array([(0.0, 0, 0), (0.01, 0, 0), (0.02, 0, 0), (0.03, 0, 0)])
+    region, deviation = np.array([0, 0, 0, 1]), np.array([0.0, 0.001, 0.002, 0.003])
+    steep = module._gradients(places, region, deviation, np.zeros(4), 0.012)
+    np.testing.assert_allclose(steep, [0.1, 0.1, 0.1, 0], atol=1e-9)
+    unknown = module._gradients(places, region, deviation, np.full(4, np.inf), 0.012)
+    np.testing.assert_array_equal(unknown, 0)

@@ -15,11 +15,11 @@ import pytest
 from posed_results import DISTANCE, NORMAL, POSED, POSES, made_result, plane
 from tofuse.apps.cli.program import main
 from tofuse.apps.export.exporting import export
+from tofuse.apps.export.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from tofuse.apps.results.folders import OutputFolder
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
-from tofuse.engine.fusion.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from tofuse.engine.geometry import quaternion, se3
 from tofuse.formats.export.octomap import write_octomap
 from tofuse.formats.geometry.ply import read_ply, write_ply

@@ -137,6 +137,11 @@ def make_card(results: Sequence[Path]) -> Card:
             where=results[0],
             remedy="run `tofuse run` again, with more views of the same place",
         )
+    return card_of(camera, sessions)
+
+
+def card_of(camera: Identity, sessions: Sequence[Session]) -> Card:
+    """Test whether the quantities of a camera change between sessions, in the order of dates."""
     drifts = {}
     for name in QUANTITIES:
         times, values, sigmas = series(sessions, name)

@@ -9,7 +9,6 @@ from typing import Self
 import numpy as np
 
 from tofuse.apps.certainty.surfaces import Seen, Surfaces, pair_information, scales
-from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.frames import Frame, RangeFrame, evenly_spaced
 from tofuse.engine.geometry import se3
@@ -27,13 +26,6 @@ _PAIRS_SAMPLED = 10
 # Pairs are selected and compared as by the refinement, at the present poses.
 _ALIGNMENT = pair_equations.RefineOptions(rounds=(pair_equations.Round(2, 0.0, 0.0),), points=600)
 _OVERLAP, _NEIGHBOURS = _ALIGNMENT.overlap, _ALIGNMENT.neighbours
-# What an alignment takes for constrained, and for a tilt that both views share.
-_TRACKING = projective.ProjectiveOptions()
-# Errors of a motion above which it counts as not bounded.
-_LIMITS = np.array([_TRACKING.prior_m, _TRACKING.prior_rad])
-# Variance of motions that no measurement bounds: m^2 and rad^2. Far above any bound, and not so far
-# that the rest is lost to rounding.
-_OPEN = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,30 +37,25 @@ class Known:
     Attributes
     ----------
     surfaces, responses
-        Known surfaces, and `Surfaces.responses` along the normal, along the surface where its
-        brightness told something, and along all surfaces.
-    now
-        (4, 4) latest pose.
+        Known surfaces, and `Surfaces.responses`.
     poses, ages_s, frames
         (K, 4, 4), (K,) time since then, and (K,) frame indices.
     centre
         (3,) mean of the positions in the world; `poses` and `surfaces` are relative to it.
     seen
         What they see.
-    covariance, opened
-        (6K, 6K) of their motions, with the predicted ones where none was measured; and where these
-        are free.
-    parts, is_open
-        (K,) number of the part of each: no measurement bounds the motion between two parts; and
-        whether its own motion is bounded only by that of its neighbours.
+    covariance
+        (6K, 6K) of their motions, with the predicted ones where none was measured.
+    parts
+        (K,) number of the part of each: no measurement bounds the motion between two parts.
     scales
         (2,) see `surfaces.scales`.
     partners
         (K,) number of views that each one is compared with: pairs of a view share its errors.
     views_each
         Number of views that each keyframe stands for.
-    bound_m, quantile
-        Present 95 % bound, and that of an rms error of 1.
+    bound_m
+        Present 95 % bound.
     other_squares
         The part of its square that is due to the calibration of the camera, which more views don't
         improve, relative to the rest.
@@ -76,21 +63,17 @@ class Known:
 
     surfaces: Surfaces
     responses: Float32
-    now: Float64
     poses: Float64
     ages_s: Float64
     frames: Intp
     centre: Float64
     seen: Seen
     covariance: Float64
-    opened: Float64
     parts: Intp
-    is_open: Bool
     scales: Float64
     partners: Float64
     views_each: float
     bound_m: float
-    quantile: float
     other_squares: float = 0.0
 
     @classmethod
@@ -98,7 +81,8 @@ class Known:
         """Return what a mapper knows; None if that is too little."""
         graph = known.graph
         row = {int(index): k for k, index in enumerate(graph.ids)}
-        views = [v for v in known.views if v.index in row]
+        steady = row.keys() - known.degenerate
+        views = [v for v in known.views if v.index in steady]
         if len(views) < 2:
             return None
         chosen = evenly_spaced(np.arange(len(views)), _KEYFRAMES - 1)
@@ -113,9 +97,9 @@ class Known:
         bounded = ~np.where(graph.loop, ends.any(1), ends[:, 1])
         parts = sparse.parts_of(len(graph.ids), graph.edges[bounded])
         found = cls._of_graph(
-            graph, positions, known.timestamps, surfaces, centre, each, sampled, parts, is_open
+            graph, positions, known.timestamps, surfaces, centre, each, sampled, parts
         )
-        return None if found is None else found.steady()._with_pairs()
+        return None if found is None else found._with_pairs()
 
     @classmethod
     def of_result(cls, result: Reconstruction, frame: Frame | None) -> Self | None:
@@ -154,9 +138,7 @@ class Known:
         is_open = np.array([len(unobservable[i]) > 0 for i in graph.ids.tolist()])
         unbounded = np.isin(graph.ids, result.diagnostics.accuracy.unbounded)
         parts = np.where(unbounded, 1 + np.cumsum(is_open), 0)
-        found = cls._of_graph(
-            graph, positions, times, surfaces, centre, each, sampled, parts, is_open
-        )
+        found = cls._of_graph(graph, positions, times, surfaces, centre, each, sampled, parts)
         if found is None:
             return None
         found = replace(
@@ -182,7 +164,6 @@ class Known:
         each: float,
         sampled: _Pairs,
         parts: Intp,
-        is_open: Bool,
     ) -> Self | None:
         positions = np.union1d(positions, [len(graph.ids) - 1])
         C = graph_covariances.GraphCovariances(graph).joint(positions)
@@ -191,56 +172,28 @@ class Known:
         poses, k = graph.poses[positions], len(positions)
         A = se3.adjoint(poses)
         blocks = A[:, None] @ C.reshape(k, 6, k, 6).swapaxes(1, 2) @ np.swapaxes(A, 1, 2)[None]
-        C = blocks.swapaxes(1, 2).reshape(6 * k, 6 * k)
-        opened = evenly_spaced(np.flatnonzero(is_open), _KEYFRAMES)
-        plain = (surfaces.seen_from(graph.poses[opened]).pixels > 0).any(axis=0)
-        responses = surfaces.responses(np.asarray(plain, np.bool_))
+        responses = surfaces.responses()
         known = cls(
             surfaces,
             responses,
-            poses[-1],
             poses,
             times[-1] - times[positions],
             graph.ids[positions],
             centre,
             surfaces.seen_from(poses),
-            C,
-            C,
+            blocks.swapaxes(1, 2).reshape(6 * k, 6 * k),
             parts[positions],
-            is_open[positions],
             sampled.scales(surfaces, responses),
             np.ones(k),
             each,
             0.0,
-            0.0,
         )
-        bound_m = known.bound(known.covariance)
-        return replace(
-            known,
-            bound_m=np.inf if len(np.unique(known.parts[~known.is_open])) > 1 else bound_m,
-            quantile=bound_m / max(known.mean_square, 1e-30) ** 0.5,
-        )
-
-    def steady(self) -> Self:
-        """Return it without keyframes that only their neighbours bound, if there are others."""
-        rows = np.flatnonzero(~self.is_open)
-        if not self.is_open.any() or len(rows) < 2:
-            return self
-        which = (6 * rows[:, None] + np.arange(6)).ravel()
-        C, parts = self.covariance[np.ix_(which, which)], self.parts[rows]
-        names = ("poses", "ages_s", "frames", "parts", "is_open", "partners")
-        return replace(
-            self,
-            seen=self.seen.of(rows),
-            covariance=C,
-            opened=C + np.kron(parts[:, None] == parts, _OPEN * np.eye(6)),
-            **{name: getattr(self, name)[rows] for name in names},
-        )
+        return replace(known, bound_m=known.bound(known.covariance))
 
     @property
     def gaps(self) -> Intp:
         """Positions of keyframes, the motion from which to the next one is not bounded."""
-        return np.flatnonzero((self._step_squares(self.opened) > _LIMITS**2).any(1))
+        return np.flatnonzero(np.diff(self.parts))
 
     def _with_pairs(self) -> Self:
         """Return it with all pairs of keyframes that overlap, as the refinement will compare."""
@@ -251,15 +204,12 @@ class Known:
             return self
         partners = np.maximum(np.bincount(pairs.ravel(), minlength=len(self.poses)), 1.0)
         i, j = pairs.T
-        H = self._information(self.seen.of(i), self.seen.of(j), self.poses[j])
+        H = self._information(self.seen.of(i), self.seen.of(j))
         H *= (self.views_each / (0.5 * (partners[i] + partners[j])))[:, None, None]
         L = _laplacian(len(self.poses), pairs, H)
-        solved = [
-            np.linalg.solve(np.eye(len(L)) + C @ L, C) for C in (self.covariance, self.opened)
-        ]
-        C, opened = (0.5 * (C + C.T) for C in solved)
-        known = replace(self, covariance=C, opened=opened, partners=partners)
-        return replace(known, bound_m=np.inf if len(known.gaps) else known.bound(known.covariance))
+        C = np.linalg.solve(np.eye(len(L)) + self.covariance @ L, self.covariance)
+        known = replace(self, covariance=0.5 * (C + C.T), partners=partners)
+        return replace(known, bound_m=known.bound(known.covariance))
 
     @property
     def _jacobians(self) -> Float64:
@@ -293,59 +243,27 @@ class Known:
     @property
     def step_squares(self) -> Float64:
         """(K - 1,) mean squares of the errors of position from each keyframe to the next."""
-        return self._step_squares(self.covariance)[:, 0]
-
-    def _step_squares(self, covariance: Float64) -> Float64:
-        """(K - 1, 2) mean squares of the errors from each keyframe to the next: m^2 and rad^2."""
         k = len(self.poses)
         D = np.kron(np.diff(np.eye(k), axis=0), np.eye(6))
-        blocks = (D @ covariance @ D.T).reshape(k - 1, 6, k - 1, 6)
+        blocks = (D @ self.covariance @ D.T).reshape(k - 1, 6, k - 1, 6)
         C = blocks[np.arange(k - 1), :, np.arange(k - 1), :]
         J = self._jacobians[1:]
-        of_rotations = np.trace(C[:, 3:, 3:], axis1=1, axis2=2)
-        return np.stack([np.einsum("kij,kjl,kil->k", J, C, J), of_rotations], 1)
+        return np.asarray(np.einsum("kij,kjl,kil->k", J, C, J), np.float64)
 
     def bound(self, covariance: Float64) -> float:
-        """Return the 95 % bound on the rms error of the positions, by a covariance alone."""
+        """Return the 95 % bound on the rms error of the positions, by a covariance alone.
+
+        None of them has one if some motion has none.
+        """
+        if len(self.gaps):
+            return np.inf
         P = self._to_positions
         return pose_accuracy.bound_by_covariance(P @ covariance @ P.T)
 
-    def expected(
+    def factors(
         self, poses: Float64, ways: Sequence[Sequence[int]], views: Sequence[float]
     ) -> Float64:
-        """(W,) bounds expected after scanning along each of some ways; see `variances`."""
-        P, C = self._to_positions, self.covariance
-        squares = self.variances(poses, ways, views, P, C).sum(1) / len(self.poses)
-        if not np.isfinite(self.bound_m):
-            return self.quantile * np.sqrt(squares)
-        before = self.mean_square
-        ratio = squares / before if before > 0 else np.ones(len(squares))
-        return self.bound_m * np.sqrt((ratio + self.other_squares) / (1 + self.other_squares))
-
-    def open_after(
-        self, poses: Float64, ways: Sequence[Sequence[int]], views: Sequence[float]
-    ) -> Float64:
-        """(W, G) errors of the motion over each gap after each of some ways; see `variances`.
-
-        In units of the limits above which it counts as not bounded.
-        """
-        gaps, k = self.gaps, len(self.poses)
-        J = np.concatenate([self._jacobians[gaps + 1], np.eye(6)[None, 3:].repeat(len(gaps), 0)], 1)
-        P = np.zeros((len(gaps), 6, k, 6))
-        P[np.arange(len(gaps)), :, gaps + 1], P[np.arange(len(gaps)), :, gaps] = J, -J
-        left = self.variances(poses, ways, views, P.reshape(-1, 6 * k), self.opened)
-        of_parts = left.reshape(len(ways), len(gaps), 2, 3).sum(3)
-        return np.sqrt(of_parts / _LIMITS**2).max(2)
-
-    def variances(
-        self,
-        poses: Float64,
-        ways: Sequence[Sequence[int]],
-        views: Sequence[float],
-        P: Float64,
-        C: Float64,
-    ) -> Float64:
-        """(W, R) variances of functions P (R, 6K) of the motions after each of some ways.
+        """(W,) factors by which uncertainty falls by scanning along each of some ways.
 
         Parameters
         ----------
@@ -355,22 +273,20 @@ class Known:
             Positions in `poses` of each way, in its order.
         views
             Numbers of views from the target, the last pose of a way, and from each one before.
-        C
-            (6K, 6K) covariance before.
         """
+        P, C = self._to_positions, self.covariance
         seen = self.surfaces.seen_from(poses)
         together = np.zeros((len(poses), len(poses)), np.bool_)
         for way in ways:
             together[np.ix_(way, way)] = True
         links = np.argwhere(np.triu(self._overlapping(seen, poses, seen, poses) & together, 1))
-        ends = seen.of(links[:, 0]), seen.of(links[:, 1])
-        H_links = self._information(*ends, poses[links[:, 1]])
+        H_links = self._information(seen.of(links[:, 0]), seen.of(links[:, 1]))
         pairs = np.argwhere(self._overlapping(self.seen, self.poses, seen, poses))
         pairs = joint_alignment.spread_evenly(pairs, _NEIGHBOURS)
-        ends = self.seen.of(pairs[:, 0]), seen.of(pairs[:, 1])
-        H_pairs = self._information(*ends, poses[pairs[:, 1]])
+        H_pairs = self._information(self.seen.of(pairs[:, 0]), seen.of(pairs[:, 1]))
         PC = P @ C
-        variances = np.tile((PC * P).sum(1), (len(ways), 1))
+        before = float((PC * P).sum())
+        squares = np.full(len(ways), before)
         for k, way in enumerate(ways):
             to_known, among = np.isin(pairs[:, 1], way), np.isin(links, way).all(1)
             rows = np.unique(pairs[to_known, 0])
@@ -394,29 +310,18 @@ class Known:
             L = full[:q, :q] - full[:q, q:] @ solved
             which = (6 * rows[:, None] + np.arange(6)).ravel()
             inner = L @ np.linalg.inv(np.eye(q) + C[np.ix_(which, which)] @ L)
-            variances[k] -= ((PC[:, which] @ inner) * PC[:, which]).sum(1)
-        return np.maximum(variances, 0.0)
+            squares[k] = before - float(((PC[:, which] @ inner) * PC[:, which]).sum())
+        ratio = np.maximum(squares, 0.0) / before if before > 0 else np.ones(len(squares))
+        return np.sqrt((ratio + self.other_squares) / (1 + self.other_squares))
 
     def _overlapping(self, a: Seen, poses: Float64, b: Seen, others: Float64) -> Bool:
         """(M, N) whether views at poses are compared with those at others."""
         similar = poses[:, :3, 2] @ others[:, :3, 2].T > 0
         return np.asarray((a.overlap(b) >= _OVERLAP) & similar, np.bool_)
 
-    def _information(self, a: Seen, b: Seen, poses: Float64) -> Float64:
-        """(M, 6, 6) information of pairs of views, the second ones at poses.
-
-        Where a motion is not bounded, less what a tilt of all normals simulates, as alignments tell
-        a constrained direction.
-        """
-        kinds = pair_information(a, b, self.responses)
-        H = np.einsum("k,mkab->mab", self.scales, kinds[:, :2])
-        if np.isfinite(self.bound_m):
-            return H
-        H -= _TRACKING.common_tilt**2 * self.scales[0] * kinds[:, 2]
-        A = se3.adjoint(poses) * projective.UNITS
-        values, V = np.linalg.eigh(np.swapaxes(A, 1, 2) @ H @ A)
-        B = np.linalg.solve(np.swapaxes(A, 1, 2), V * np.sqrt(np.maximum(values, 0.0))[:, None])
-        return B @ np.swapaxes(B, 1, 2)
+    def _information(self, a: Seen, b: Seen) -> Float64:
+        """(M, 6, 6) information of pairs of views."""
+        return np.einsum("k,mkab->mab", self.scales, pair_information(a, b, self.responses))
 
 
 def _laplacian(count: int, pairs: Intp, H: Float64) -> Float64:
@@ -449,7 +354,7 @@ class _Pairs:
         first, second = surfaces.seen_from(self.first), surfaces.seen_from(self.second)
         A = se3.adjoint(se3.inverse(self.second))
         measured = np.swapaxes(A, 1, 2) @ self.information @ A
-        return scales(measured, pair_information(first, second, responses)[:, :2])
+        return scales(measured, pair_information(first, second, responses))
 
 
 def _measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> _Pairs:

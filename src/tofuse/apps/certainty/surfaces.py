@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 
-from tofuse.engine.arrays import Bool, Float32, Float64, Intp
+from tofuse.engine.arrays import Float32, Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views import PosedView, sampled_points
 from tofuse.engine.views import PreparedView, residual_kernels
@@ -129,26 +129,24 @@ class Surfaces:
         information[row, column] = pixels[row, column] / z2
         return Seen(pixels, information)
 
-    def responses(self, plain: Bool) -> Float32:
-        """(P, 3, 6, 6) information of a point along its normal, and twice along the surface.
+    def responses(self) -> Float32:
+        """(P, 2, 6, 6) information of a point along its normal, and along the surface.
 
         It is that of small motions of a view in the world: translation, and rotation about the
-        origin. The first one along the surface is 0 for those that are `plain` (P,).
+        origin.
         """
         normal, p = self.normals.astype(float), self.points.astype(float)
         along = np.concatenate([normal, np.cross(p, normal)], 1)
         J = np.concatenate([np.broadcast_to(np.eye(3), (len(p), 3, 3)), -se3.hat(p)], 2)
         first = along[:, :, None] * along[:, None]
-        second = np.swapaxes(J, 1, 2) @ J - first
-        shown = np.where(plain[:, None, None], 0.0, second)
-        return np.stack([first, shown, second], 1).astype(np.float32)
+        return np.stack([first, np.swapaxes(J, 1, 2) @ J - first], 1).astype(np.float32)
 
 
 def pair_information(a: Seen, b: Seen, responses: Float32) -> Float64:
-    """(M, n, 6, 6) information of each pair of views (M) by kind, up to its scale."""
+    """(M, 2, 6, 6) information of each pair of views (M) by kind, up to its scale."""
     common = np.minimum(a.information, b.information)
     flat = responses.reshape(len(responses), -1)
-    return (common @ flat).reshape(-1, *responses.shape[1:]).astype(np.float64)
+    return (common @ flat).reshape(-1, 2, 6, 6).astype(np.float64)
 
 
 def scales(measured: Float64, predicted: Float64) -> Float64:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,16 +23,12 @@ _TURNS = (
 # known worst relative to each other. On the way there is a look after at most this angle (rad) and
 # part of the reach, within limits.
 _REVISITS, _WEAK, _STEP_ANGLE, _STEP, _MAX_LOOKS = 8, 5, 0.6, 0.2, 5
-# On a slow way looks are so many times as dense: each holds on to what the one before sees.
-_SLOW = 3
 # A surface so near to the straight way, relative to its length, is in the way.
 _BLOCKED = 0.08
 # Numbers of views from there, one to two seconds of a moving camera, and from each look before.
 _VIEWS = 8.0, 2.0
 # Of candidates whose gain is at least this fraction of the largest, the nearest is advised.
 _NEARLY_BEST = 0.9
-# Over a gap, of those whose bound is at most so many times the lowest.
-_EASY = 2.0
 # A keyframe within this fraction of the reach is a turn away.
 _SAME_PLACE = 0.1
 # Degrees that are not named, and that are half a turn; share of a step that is named.
@@ -70,8 +64,8 @@ class Advice:
 
     @property
     def gain_m(self) -> float:
-        """Expected fall of the bound; inf if it is one at all."""
-        return self.bound_m - self.expected_m if np.isfinite(self.expected_m) else 0.0
+        """Expected fall of the bound; 0 where there is none."""
+        return self.bound_m - self.expected_m if np.isfinite(self.bound_m) else 0.0
 
 
 def advise(source: Mapper | Reconstruction) -> Advice | None:
@@ -94,7 +88,7 @@ def advise(source: Mapper | Reconstruction) -> Advice | None:
         return advise_on(source.so_far())
     recording = getattr(source, "source", None)
     known = Known.of_result(source, None if recording is None else recording.first_readable())
-    return None if known is None else best(known.steady())
+    return None if known is None else best(known)
 
 
 def advise_on(so_far: OnlineMap) -> Advice | None:
@@ -105,57 +99,24 @@ def advise_on(so_far: OnlineMap) -> Advice | None:
 
 def best(known: Known, within_s: float = np.inf) -> Advice:
     """Return the best advice by what is known, with places of the last seconds only."""
-    if len(known.gaps):
-        return _over_gaps(known, within_s)
     poses, moves = candidates(known, within_s)
-    bounds = known.expected(poses, [move.way for move in moves], _VIEWS)
-    is_bound = np.isfinite(known.bound_m)
-    bound_m = known.bound_m if is_bound else known.quantile * known.mean_square**0.5
-    move, expected_m = _easiest(moves, bounds, bound_m - _NEARLY_BEST * (bound_m - bounds.min()))
+    factors = known.factors(poses, [move.way for move in moves], _VIEWS)
+    good = np.flatnonzero(1 - factors >= _NEARLY_BEST * (1 - factors.min()))
+    chosen = min(good.tolist(), key=lambda k: moves[k].effort)
+    move, factor, bound_m = moves[chosen], float(factors[chosen]), known.bound_m
+    expected_m = factor * bound_m
     before, after = _millimetres(bound_m), _millimetres(expected_m)
     gain = f"{before} to {after} mm"
-    if not is_bound:
-        gain = f"{100 * (1 - expected_m / bound_m):.0f} % less uncertain"
-        expected_m = np.inf
+    if not np.isfinite(bound_m):
+        gain = f"{100 * (1 - factor):.0f} % less uncertain"
+        if len(known.gaps):
+            gain += f", but nothing bounds the motion {known.ages_s[known.gaps[-1]]:.0f} s ago"
     elif before == after:
         return Advice(bound_m, bound_m, f"go on: no look back would lower the {before} mm")
-    pose = _in_world(known, poses[move.way[-1]])
-    return Advice(known.bound_m, expected_m, f"{move.words}: {gain}", pose, move.frame)
-
-
-def _over_gaps(known: Known, within_s: float) -> Advice:
-    """Advise how to bound as many motions as one way can that no measurement bounds."""
-    poses, moves = bridges(known, within_s)
-    left = known.open_after(poses, [move.way for move in moves], _VIEWS)
-    # An easy way counts more than a low bound: tracking must not be lost on it.
-    most = np.sum(left < 1, axis=1)
-    worst = np.where(most == most.max(), np.where(left < 1, left, 0).max(1), np.inf)
-    if not most.any():
-        worst = left.min(1)
-    move, _ = _easiest(moves, worst, max(_EASY * worst.min(), 1e-9))
-    at = known.gaps[np.argmin(left[moves.index(move)])]
-    words = f"nothing bounds the motion {known.ages_s[at]:.0f} s ago: {move.words}"
-    expected_m = np.inf
-    if most.max() == len(known.gaps):
-        expected_m = float(known.expected(poses, [move.way], _VIEWS)[0])
-        words += f", then {_millimetres(expected_m)} mm"
+    pose = poses[move.way[-1]].copy()
+    pose[:3, 3] += known.centre
     gaps = tuple((int(known.frames[k]), int(known.frames[k + 1])) for k in known.gaps)
-    pose = _in_world(known, poses[move.way[-1]])
-    return Advice(np.inf, expected_m, words, pose, move.frame, gaps)
-
-
-def _easiest(
-    moves: Sequence[Candidate], bounds: Float64, limit_m: float
-) -> tuple[Candidate, float]:
-    """Return the nearest of the ways with a bound within a limit, and its bound."""
-    chosen = min(np.flatnonzero(bounds <= limit_m).tolist(), key=lambda k: moves[k].effort)
-    return moves[chosen], float(bounds[chosen])
-
-
-def _in_world(known: Known, T: Float64) -> Float64:
-    out = T.copy()
-    out[:3, 3] += known.centre
-    return out
+    return Advice(bound_m, expected_m, f"{move.words}: {gain}", pose, move.frame, gaps)
 
 
 @dataclass(frozen=True)
@@ -173,7 +134,7 @@ class Candidate:
 
 def candidates(known: Known, within_s: float = np.inf) -> tuple[Float64, list[Candidate]]:
     """Return poses (M, 4, 4) relative to the centre, and turns and ways to earlier places."""
-    now = known.now
+    now = known.poses[-1]
     poses: list[Float64] = []
     moves = []
     for turns in _TURNS:
@@ -199,47 +160,13 @@ def candidates(known: Known, within_s: float = np.inf) -> tuple[Float64, list[Ca
     return np.stack(poses), moves
 
 
-def bridges(known: Known, within_s: float = np.inf) -> tuple[Float64, list[Candidate]]:
-    """Return poses (M, 4, 4) and ways that look at both sides of a gap from one place.
-
-    From earlier places, from one side's view to the other's: from farther away, what bounds the
-    motion on one side comes into view before what bounds it on the other side has left.
-    """
-    poses: list[Float64] = []
-    moves = []
-    weights = known.seen.pixels.astype(float)
-    seen = weights @ known.surfaces.points / weights.sum(1, keepdims=True).clip(1e-9)
-    places = evenly_spaced(np.flatnonzero(known.ages_s <= within_s), _REVISITS).tolist()
-    for gap, k in itertools.product(known.gaps[-_WEAK:].tolist(), places):
-        for a, b in ((gap, gap + 1), (gap + 1, gap)):
-            start, end = (_looking_at(known.poses[k], seen[side]) for side in (a, b))
-            angle = float(se3.angle(se3.inverse(start) @ end))
-            count = 1 + int(_SLOW * angle / _STEP_ANGLE)
-            looks, words, effort = _way_to(known, k, start, _SLOW)
-            way = tuple(range(len(poses), len(poses) + len(looks) + count))
-            poses += [*looks, *se3.interpolate(start, end, np.arange(1, count + 1) / count)]
-            first, last = known.ages_s[[a, b]]
-            words += f", and turn slowly from what you saw {first:.0f} s ago to {last:.0f} s ago"
-            moves.append(Candidate(way, words, effort + angle, int(known.frames[k])))
-    return np.stack(poses), moves
-
-
-def _looking_at(T: Float64, point: Float64) -> Float64:
-    """Turn a pose T (4, 4) about its place so that a point (3,) is ahead."""
-    d = T[:3, :3].T @ (point - T[:3, 3])
-    axis = np.cross([0, 0, 1], d)
-    sine = float(np.linalg.norm(axis))
-    return T @ se3.exp([0, 0, 0, *(axis * np.arctan2(sine, d[2]) / max(sine, 1e-9))])
-
-
-def _way_to(known: Known, k: int, target: Float64, slow: int = 1) -> tuple[Float64, str, float]:
+def _way_to(known: Known, k: int, target: Float64) -> tuple[Float64, str, float]:
     """Return looks (n, 4, 4) on the way to a target at keyframe k, its words and its effort."""
-    now, reach = known.now, known.surfaces.reach_m
+    now, reach = known.poses[-1], known.surfaces.reach_m
     motion = se3.inverse(now) @ target
     step, angle = float(np.linalg.norm(motion[:3, 3])), float(se3.angle(motion))
     seconds = f"{known.ages_s[k]:.0f} s ago"
-    dense = max(angle / _STEP_ANGLE, step / reach / _STEP)
-    looks = int(np.clip(np.ceil(slow * dense), 1, slow * _MAX_LOOKS))
+    looks = int(np.clip(np.ceil(max(angle / _STEP_ANGLE, step / reach / _STEP)), 1, _MAX_LOOKS))
     if step < _SAME_PLACE * reach:
         words = f"{_turn(*_direction(motion[:3, 2]))}, to what you saw {seconds}"
     else:

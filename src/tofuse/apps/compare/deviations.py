@@ -324,7 +324,9 @@ def _gradients(
     rise = np.where(near, deviation[index] - deviation[:, None], 0.0)
     inverse = np.linalg.pinv(np.where(near[..., None], offset, 0.0), rcond=0.3)
     square = (np.einsum("kij,kj->ki", inverse, rise) ** 2).sum(1)
-    noise = 2 * variance * (inverse**2).sum((1, 2))
+    gain = (inverse**2).sum((1, 2))
+    # None without neighbours, even where the variance is infinite.
+    noise = np.multiply(2 * variance, gain, out=np.zeros_like(gain), where=gain > 0)
     return np.asarray(np.sqrt(np.maximum(square - noise, 0.0)))
 
 

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from tofuse.apps.export.occupancy import FREE, OCCUPIED, OccupancyGrid
 from tofuse.apps.export.scene import Scene
 from tofuse.apps.results import reopening, run_json
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import CloudFrame
-from tofuse.engine.fusion import occupancy
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import adaptation, clips
 from tofuse.formats.export import write_octomap
@@ -26,7 +26,7 @@ _DIAGONAL = 400
 _ROUND = (1.0, 2.0, 5.0, 10.0)
 
 
-def occupancy_grid(scene: Scene, voxel_m: float | None = None) -> occupancy.OccupancyGrid:
+def occupancy_grid(scene: Scene, voxel_m: float | None = None) -> OccupancyGrid:
     """Cast rays to all points of the frames of a result, filtered as for the model.
 
     Parameters
@@ -43,7 +43,7 @@ def occupancy_grid(scene: Scene, voxel_m: float | None = None) -> occupancy.Occu
         If the recording is missing or has changed, or the grid would be too large.
     """
     corners = np.concatenate([scene.cloud.points, scene.poses[:, :3, 3]]).astype(float)
-    grid = occupancy.OccupancyGrid.around(corners, voxel_m or _default_voxel(corners))
+    grid = OccupancyGrid.around(corners, voxel_m or _default_voxel(corners))
     rows = slice(None, None, scene.every)
     selected = dict(zip(scene.indices[rows].tolist(), scene.poses[rows], strict=True))
     with run_json.opened(scene.result) as run:
@@ -86,7 +86,7 @@ class Grid:
     voxel_m: float | None
 
     @cached_property
-    def _grid(self) -> occupancy.OccupancyGrid:
+    def _grid(self) -> OccupancyGrid:
         return occupancy_grid(self.scene, self.voxel_m)
 
     def write_occupancy(self, path: Path) -> None:
@@ -100,7 +100,7 @@ class Grid:
     def write_octomap(self, path: Path) -> None:
         """Write an octree of OctoMap, relative to the `shift_of` the result."""
         states = self._grid.states
-        free, occupied = states == occupancy.FREE, states == occupancy.OCCUPIED
+        free, occupied = states == FREE, states == OCCUPIED
         write_octomap(path, free, occupied, self._grid.first, self._grid.voxel_m)
 
     def _write(self, path: Path, **arrays: Any) -> None:

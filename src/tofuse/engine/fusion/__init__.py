@@ -2,8 +2,7 @@
 
 A `ModelBuilder` stores views until their final poses are known and fuses them, by the options
 `Fusion`, into a `Model` of a `Cloud` and a `Mesh`, both with standard deviations. Files are
-written from a `GeometryRecord`. `texture` paints a mesh; `T_up_world` turns it upright;
-`occupancy` says where space is free.
+written from a `GeometryRecord`. `texture` paints a mesh; `T_up_world` turns it upright.
 """
 
 from typing import TYPE_CHECKING
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.fusion import display_surface, drawing, occupancy, texture
+    from tofuse.engine.fusion import display_surface, drawing, texture
     from tofuse.engine.fusion.cloud import Cloud, as_cloud
     from tofuse.engine.fusion.geometry_record import GeometryRecord
     from tofuse.engine.fusion.mesh import Mesh
