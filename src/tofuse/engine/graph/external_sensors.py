@@ -371,7 +371,7 @@ class _Comparison:
 
         Each of translation and of rotation; None if they don't explain the disagreement.
         """
-        misfit = se3.log(se3.inverse(self.tracked) @ self.odometry)
+        misfit = self._misfit
         weight = 1 / self.spans  # about as many are independent as don't overlap
 
         def cost(logarithms: Float64) -> float:
@@ -410,9 +410,16 @@ class _Comparison:
 
     @property
     def shares_errors(self) -> bool:
-        """Whether odometry has the errors of tracking: it is computed from the same images."""
-        misfit = se3.log(se3.inverse(self.tracked) @ self.odometry)
-        return self.verified and float(np.median(_squared(misfit, self.covariances))) < _SHARED
+        """Whether odometry has the errors of tracking, over short motions and over long ones."""
+        return self.verified and all(
+            float(np.median(_squared(part._misfit, part.covariances))) < _SHARED
+            for part in self.by_length()
+        )
+
+    @property
+    def _misfit(self) -> Float64:
+        """(K, 6) disagreement of the two."""
+        return se3.log(se3.inverse(self.tracked) @ self.odometry)
 
     def lengths_agree(self, scales: Float64) -> bool:
         """Whether tracked lengths differ from those of the odometry by less than half (95 %)."""
