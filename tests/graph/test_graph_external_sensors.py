@@ -267,6 +267,22 @@ def test_jump_of_odometry_is_left_out():
     np.testing.assert_allclose(steps[1].T_i_j, expected, atol=1e-9)
 
 
+def test_odometry_from_the_same_depth_is_no_evidence():
+    """It has the errors of the tracked motion, except where that is extrapolated."""
+    graph = tracked(truth(), 0 * NODDING)
+    same = odometer(graph.poses, 0.0005)
+    measured = measure_all((OdometryEdges(),), sensed(same), graph)
+    assert not measured.steps
+    assert not measured.is_continuous
+    assert "computed from it" in measured.records[0].text
+    wall = (np.arange(N) >= 20) & (np.arange(N) < 24)
+    measured = measure_all((OdometryEdges(),), sensed(same, degenerate=wall), graph)
+    assert {step.i for step in measured.steps} == {19, 20, 21, 22, 23}
+    # Independent odometry differs by the errors of tracking, however good it is itself.
+    exact = measure_all((OdometryEdges(),), sensed(truth()), graph)
+    assert len(exact.steps) == N - 1
+
+
 def test_missing_sensors_change_nothing():
     graph = tracked(truth(), NODDING)
     measured = measure_all((GravityEdges(), OdometryEdges()), sensed(), graph)

@@ -14,7 +14,13 @@ from tofuse.engine.graph import external_sensors
 from tofuse.engine.graph.graph import build_graph
 from tofuse.engine.graph.graph_covariances import GraphCovariances
 from tofuse.engine.quality.pose_accuracy import ObservedErrors, accuracy_of
-from tofuse.engine.refinement.joint_alignment import Bodies, refine, spread_evenly
+from tofuse.engine.refinement.joint_alignment import (
+    MAX_LOSS,
+    Bodies,
+    refine,
+    spread_evenly,
+    support_fell,
+)
 from tofuse.engine.refinement.refinement import Joint, NoRefinement, propagate_poses, without_errors
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views.view_store import SampledView, Spacing, ViewStore, overlaps
@@ -144,6 +150,22 @@ def test_refinement_is_kept_only_if_views_support_it():
     assert not same.edges
     np.testing.assert_array_equal(same.poses, apart)
     np.testing.assert_array_equal(refiner(NoRefinement(), views, start).poses, start)
+
+
+def test_measurements_of_poses_at_the_optimum_are_kept():
+    """Their support may fall by next to nothing, in all views alike: that says nothing."""
+    truth = path(8)
+    found = refiner(Joint(), surfaces(truth, noise=0.01), truth)
+    assert found.support[1] < found.support[0]
+    assert found.kept
+    assert found.edges
+    np.testing.assert_allclose(found.poses, truth, atol=1e-12)
+    # Where the measurements would have the poses instead.
+    assert 0.001 < found.disputed_m < 0.005
+    alike = np.linspace(-0.0012, -0.0004, 36)
+    assert not support_fell(alike)
+    assert support_fell(alike - 0.5 * MAX_LOSS)
+    assert support_fell(np.where(np.arange(36) < 9, -0.2, 0.01))
 
 
 def test_shared_pixel_error_counts_once_in_joint_refinement():

@@ -192,6 +192,8 @@ def test_camera_shows_its_image_over_the_model(browser, server) -> None:
     with opened(browser, server) as seen:
         page = seen.page
         page.locator("#viewer.live").wait_for(timeout=20_000)
+        page.get_by_text("Colours, cameras and views").click()
+        page.locator("#viewer .timeline canvas").scroll_into_view_if_needed()
         line = page.locator("#viewer .timeline canvas").bounding_box()
 
         def choose(frame: int) -> None:

@@ -15,6 +15,7 @@ from typing import Annotated, ClassVar, Protocol
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.special import chdtri
 
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
@@ -37,6 +38,9 @@ _DEGREES = 30.0
 _SPREAD = np.log(2.0)
 # Odometry that fewer fully constrained registrations were compared with is not verified.
 _MIN_COMPARED = 10
+# Squared disagreement, in units of tracking's errors, that one in a hundred motions of independent
+# odometry does not reach: if half of all don't, these errors are odometry's as well.
+_SHARED = float(chdtri(6, 0.99))
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +257,9 @@ class OdometryEdges(Bounded, ExternalSensor):
 
     Its errors are random walks over time, length and angle. They are scaled until these and the
     errors of tracking explain the disagreement of the two; single steps with a far larger one are
-    rejected.
+    rejected. Odometry that agrees with tracking better than the errors of tracking allow shares
+    them, as if it were computed from the same depth. Then it is no evidence, except where the
+    depth has none.
 
     Attributes
     ----------
@@ -299,7 +305,11 @@ class OdometryEdges(Bounded, ExternalSensor):
             se3.log(se3.inverse(tracked) @ measured),
             C + tracking_covariance[first] + tracking_covariance[first + 1],
         )
-        kept = np.flatnonzero(chi2 <= self.gate)
+        used = chi2 <= self.gate
+        shared = compared is not None and compared.shares_errors
+        if shared:  # it says something only where the depth says nothing
+            used &= sensed.degenerate[first] | sensed.degenerate[first + 1]
+        kept = np.flatnonzero(used)
         steps = tuple(
             Measured(
                 int(sensed.ids[first[k]]),
@@ -312,6 +322,11 @@ class OdometryEdges(Bounded, ExternalSensor):
         scale = float(odometry_scale.max())
         text = f"{len(kept)} of {len(first)} steps of the odometry are used, "
         text += "with the stated errors" if scale < 1.05 else f"with {scale:.1f} times its errors"
+        if shared:
+            text += (
+                ", those where images don't constrain the motion: it agrees with the tracked "
+                "motion better than the errors of the depth allow, as if it were computed from it"
+            )
         metric = compared is not None and compared.lengths_agree(scales)
         record = SensorRecord("odometry", len(first), len(kept), scale, text, metric)
         verified = compared is not None and compared.verified
@@ -356,7 +371,7 @@ class _Comparison:
 
         Each of translation and of rotation; None if they don't explain the disagreement.
         """
-        misfit = se3.log(se3.inverse(self.tracked) @ self.odometry)
+        misfit = self._misfit
         weight = 1 / self.spans  # about as many are independent as don't overlap
 
         def cost(logarithms: Float64) -> float:
@@ -392,6 +407,19 @@ class _Comparison:
         """(K, 6, 6) of the disagreement, by `scales`."""
         added = self.variances * np.repeat(scales[1] ** 2, 3)
         return np.asarray(_scaled(self.covariances, scales[0]) + added[:, :, None] * np.eye(6))
+
+    @property
+    def shares_errors(self) -> bool:
+        """Whether odometry has the errors of tracking, over short motions and over long ones."""
+        return self.verified and all(
+            float(np.median(_squared(part._misfit, part.covariances))) < _SHARED
+            for part in self.by_length()
+        )
+
+    @property
+    def _misfit(self) -> Float64:
+        """(K, 6) disagreement of the two."""
+        return se3.log(se3.inverse(self.tracked) @ self.odometry)
 
     def lengths_agree(self, scales: Float64) -> bool:
         """Whether tracked lengths differ from those of the odometry by less than half (95 %)."""

@@ -244,11 +244,12 @@ class Assessment:
     ) -> pose_accuracy.ObservedErrors:
         """Return the errors of the poses that their covariances don't include."""
         refinement, corrections = refined.refinement, self._estimated_corrections
-        shift = 0.0, 0.0
+        shift = refinement.disputed_m, refinement.disputed_rad
         if self._is_tracked:  # the initial error of given poses is unrelated to the final one
-            shift = trajectory_errors.displacement(
+            moved = trajectory_errors.displacement(
                 closed.optimisation.graph.poses, refined.graph.poses
             )
+            shift = max(shift[0], moved[0]), max(shift[1], moved[1])
         excess_m = 0.0 if cross_view is None else cross_view.excess_m()
         calibration = 0.0, 0.0
         if refinement.calibration_check is not None:

@@ -77,6 +77,8 @@ _MAX_MOTION = 2.0
 _PAIR_ITERATIONS, _PAIR_CONVERGED = 8, 0.002
 # Largest ratio of successive steps that is extrapolated.
 _MAX_RATIO = 0.9
+# Maximum decrease of the support of a view that keeps its refined pose: about that by chance.
+MAX_LOSS = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -591,6 +593,9 @@ def _checked(step: Float64 | None) -> Float64:
 
 
 def support_fell(gain: Float64) -> bool:
-    """Whether gains (N,) of the views' support are significantly negative on average."""
-    standard_error = float(gain.std(ddof=1)) / np.sqrt(len(gain))
+    """Whether gains (N,) of the views' support are significantly negative on average.
+
+    Where all change alike, by next to nothing, they still vary by chance as single views do.
+    """
+    standard_error = max(float(gain.std(ddof=1)), MAX_LOSS) / np.sqrt(len(gain))
     return float(gain.mean()) < -standard_error

@@ -19,10 +19,16 @@ from tofuse.engine.refinement.calibration_check import (
     check_calibration,
     combine_checks,
 )
-from tofuse.engine.refinement.joint_alignment import Priors, Refined, refine, support_fell
+from tofuse.engine.refinement.joint_alignment import (
+    MAX_LOSS,
+    Priors,
+    Refined,
+    refine,
+    support_fell,
+)
 from tofuse.engine.refinement.loop_drift import loop_gap
 from tofuse.engine.refinement.range_change import RangeChange
-from tofuse.engine.refinement.split_half import split_half_errors
+from tofuse.engine.refinement.split_half import aligned_motion, split_half_errors
 from tofuse.engine.refinement.submaps import RefinedSubmap, refine_submaps
 from tofuse.engine.stored_views import (
     CoarseView,
@@ -41,8 +47,6 @@ CameraError = Literal["offset", "scale", "focal"]
 
 # Neighbouring pixels have correlated noise: this many have the information of one.
 _CORRELATED_PIXELS = 5.0
-# Maximum decrease of the support of a view that keeps its refined pose: about that by chance.
-MAX_LOSS = 0.03
 _ERROR_INDEX: dict[CameraError, int] = {
     "offset": kernels.OFFSET,
     "scale": kernels.SCALE,
@@ -83,6 +87,8 @@ class Refinement:
         Pairs (i, j) of edges that do not come from the overlap of the two views.
     split_m, split_rad
         Rms errors of the poses by halves of the images (`split_half`); 0 unless kept.
+    disputed_m, disputed_rad
+        Rms motion to the poses that the measurements prefer, where the poses stayed.
     """
 
     poses: Float64
@@ -98,6 +104,8 @@ class Refinement:
     non_overlap_edges: tuple[tuple[int, int], ...] = ()
     split_m: float = 0.0
     split_rad: float = 0.0
+    disputed_m: float = 0.0
+    disputed_rad: float = 0.0
 
     @property
     def range_change(self) -> RangeChange | None:
@@ -256,8 +264,10 @@ class _Joint(Refiner):
         if support_fell(gain):  # the camera may be the cause
             return replace(unchanged, calibration_check=calibration)
         after = with_unsupported_views_fixed(before, refined.poses, gain < -MAX_LOSS)
+        disputed_m = disputed_rad = 0.0
         if mean[1] < mean[0]:
             # The poses were already at the optimum; the measurements give their covariances.
+            disputed_m, disputed_rad = (_rms(m) for m in aligned_motion(before, after))
             after = before
         split_m, split_rad = _mean_errors([split for _, split in evaluated])
         return replace(
@@ -265,6 +275,8 @@ class _Joint(Refiner):
             calibration_check=calibration,
             split_m=split_m,
             split_rad=split_rad,
+            disputed_m=disputed_m,
+            disputed_rad=disputed_rad,
             errors={name: float(refined.errors[_ERROR_INDEX[name]]) for name in options.calibrate},
             edges=pairwise_measurements([p.index for p in posed], refined),
         )
@@ -311,6 +323,11 @@ class _Joint(Refiner):
 
     def _sampled(self, posed: PosedView[PreparedView]) -> SampledView:
         return SampledView.of(_surface(posed), self._options.alignment.points)
+
+
+def _rms(motions: Float64) -> float:
+    """Rms length of motions (N, 3)."""
+    return float(np.sqrt((motions**2).sum(1).mean()))
 
 
 def _mean_errors(errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
