@@ -49,7 +49,8 @@ class Pair:
     """Points (n, 3) of two views in m, and the true T_target_source.
 
     That is None without overlap, or if the pose can't be known; it is good to `truth_m`. Pairs of a
-    benchmark have its information matrix (6, 6), which decides which poses are right, and a scene.
+    benchmark have its information matrix (6, 6), which decides which poses are right. Some families
+    have several scenes.
     """
 
     source: Float64
@@ -347,7 +348,8 @@ def _dragon(data: Path, max_pairs: int, _rng: np.random.Generator) -> Iterator[P
     for apart in (1, 2, 3, 4):
         for k in np.linspace(0, len(angles) - 1, max_pairs).astype(int):
             i, j = angles[k], angles[(k + apart) % len(angles)]
-            yield Pair(found[j], found[i], se3.inverse(poses[i]) @ poses[j])
+            T = se3.inverse(poses[i]) @ poses[j]
+            yield Pair(found[j], found[i], T, scene=f"{24 * apart} degrees")
     for k in range(0, len(angles) // 2, 2):
         yield Pair(found[angles[k]], found[angles[k + len(angles) // 2]], None)
 

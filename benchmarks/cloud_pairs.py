@@ -5,7 +5,8 @@ or 5 % of the extent if that is less, at the centre of the source, and 4 degrees
 3DMatch as its papers define it: an approximate rms error within 0.2 m), how many of those are
 accepted, and how many are accepted and wrong; also for the peers that are installed, with voxels of
 1/100 of the target's extent: Open3D's RANSAC over FPFH with point-to-plane ICP, KISS-Matcher, also
-with small_gicp, and small_gicp from the identity. For fragments the recall is the mean over scenes.
+with small_gicp and FRICP, and small_gicp from the identity. In brackets is the mean over scenes, or
+angles of the dragon, whose counts follow.
 Results are kept in a journal, if one is given, to continue from.
 
 `fit` fits the logistic models of `tofuse.engine.search.pose_probability`, and prints how families
@@ -50,6 +51,7 @@ PEERS: dict[str, Callable[[float], Method | None]] = {
     "Open3D": o3d_global.method,
     "KISS-Matcher": kiss_global.method,
     "KISS-Matcher, GICP": kiss_global.with_gicp,
+    "KISS-Matcher, FRICP": kiss_global.with_fricp,
     "GICP": kiss_global.gicp,
 }
 _OURS = "tofuse"
@@ -128,14 +130,23 @@ def print_table(names: list[str], data: Path, max_pairs: int, journal: Lines) ->
         print(f"| {' | '.join(map(str, cells))} |")
         outcomes[family] = np.array([(r.probability, r.right) for r in ours], float)
     print()
+    for family, scene in dict.fromkeys((r.family, r.scene) for r in found if r.scene):
+        rows = [r for r in found if (r.family, r.scene, r.method) == (family, scene, _OURS)]
+        print(f"{family}, {scene}: {_counts(rows)}")
+    print()
     cloud_belief.print_outcomes(outcomes)
+
+
+def _counts(found: list[Result]) -> str:
+    """The number of right poses."""
+    return f"{sum(r.right for r in found)} of {len(found)}"
 
 
 def _recall(found: list[Result]) -> str:
     """The number of right poses; of benchmarks also the mean over scenes of their share."""
-    count = f"{sum(r.right for r in found)} of {len(found)}"
-    scenes = {r.scene for r in found}
-    if scenes == {""}:
+    count = _counts(found)
+    scenes = {r.scene for r in found if r.scene}
+    if not scenes:
         return count
     shares = [np.mean([r.right for r in found if r.scene == scene]) for scene in scenes]
     return f"{count} ({np.mean(shares):.3f})"

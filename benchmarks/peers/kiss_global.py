@@ -1,6 +1,7 @@
-"""KISS-Matcher (Lim et al. 2025), with its default parameters for the voxel size, and small_gicp.
+"""KISS-Matcher (Lim et al. 2025), with its default parameters for the voxel size, and refinement.
 
-GICP begins at KISS-Matcher's pose, or at the identity.
+small_gicp begins at KISS-Matcher's pose, or at the identity; FRICP (Zhang et al. 2022) at
+KISS-Matcher's pose. Both get one point a voxel.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import Frame
+from tofuse.engine.icp import averaged
 
 # It refuses small voxels, so clouds are scaled to these.
 _VOXEL_M = 0.3
@@ -45,6 +47,23 @@ def with_gicp(voxel_m: float) -> Method | None:
     """KISS-Matcher, refined by small_gicp; None where one of them is not installed."""
     start = method(voxel_m)
     return None if start is None else _refined(voxel_m, start)
+
+
+def with_fricp(voxel_m: float) -> Method | None:
+    """KISS-Matcher, refined by FRICP; None where one of them is not installed."""
+    start = method(voxel_m)
+    try:
+        peer = importlib.import_module("fricp")
+    except ImportError:
+        return None
+    if start is None:
+        return None
+
+    def registered(source: Frame, target: Frame) -> Float64:
+        points = [averaged(view, voxel_m).points.astype(float) for view in (source, target)]
+        return np.array(peer.register(*points, init=start(source, target)).transform)
+
+    return registered
 
 
 def gicp(voxel_m: float) -> Method | None:

@@ -283,6 +283,9 @@ def test_evidence_of_clouds_is_lead_in_distinct_surfaces():
     assert right.probability > blind.probability
     assert right.probability > contradicted.probability
     assert "degenerate" in slides.rejection_reason()
+    assert "frames of their cameras" in " ".join(evidence(12.0, free_space=False).remedies)
+    assert "frames of their cameras" not in " ".join(evidence(1.0, free_space=False).remedies)
+    assert slides.remedies == ("another view, which overlaps both more",)
     assert all(evidence(lead).probability <= 0.5 for lead in (0.0, -3.0)), cases
 
 
@@ -458,6 +461,7 @@ def test_body_turned_by_its_symmetry_needs_guess(boxes, degrees) -> None:
     assert not found.believed
     assert found.runner_up is not None
     if len(boxes) == 1:  # thin legs leave room for doubt even at a guess
+        assert found.remedy == "a guess near it"
         guessed = tofuse.register(source, target, guess=T)
         assert guessed.believed
         assert se3.is_within(se3.inverse(T) @ guessed.T_target_source, 0.01, 0.02)

@@ -31,6 +31,8 @@ def decision(result: PairResult) -> tuple[str, str]:
         reason = reason or "the method can't verify its result"
     if reason:
         parts.append(reason)
+    if registration.remedy:
+        parts.append(f"{registration.remedy} would decide")
     return "Not verified" if registration.believed is None else "Rejected", "; ".join(parts)
 
 

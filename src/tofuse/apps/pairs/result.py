@@ -114,7 +114,7 @@ class PairResult:
 _MAX_ROTATION = 0.4
 # Attributes of a registration in `registration.json`.
 _EVIDENCE = (
-    "believed", "probability", "given_guess", "reason", "converged", "overlap", "support",
+    "believed", "probability", "given_guess", "reason", "remedy", "converged", "overlap", "support",
     "contradiction", "margin",
 )  # fmt: skip
 _FIT = ("rms_m", "correspondences", "points", "iterations")

@@ -53,6 +53,8 @@ class Registration:
         don't estimate it.
     reason
         Why the pose is rejected, in words; empty otherwise.
+    remedy
+        What would decide whether a rejected pose is right, in words; empty otherwise.
     runner_up
         (4, 4) T_target_source of the best rival; None if there is none, or none was searched for.
     overlap, support
@@ -89,6 +91,7 @@ class Registration:
     believed: bool | None = None
     probability: float | None = None
     reason: str = ""
+    remedy: str = ""
     runner_up: Float64 | None = None
     overlap: float | None = None
     support: float | None = None

@@ -106,6 +106,7 @@ class PoseEvidence:
             believed=not reason,
             probability=self.probability,
             reason=reason,
+            remedy=" or ".join(self.remedies) if reason else "",
             runner_up=runner_up,
             overlap=agreement.overlap,
             support=agreement.support,
@@ -141,6 +142,14 @@ class PoseEvidence:
         else:
             log_odds = float(self.search_regressors @ self.model.search)
         return min(logistic(log_odds), MAX_PROBABILITY)
+
+    @property
+    def remedies(self) -> tuple[str, ...]:
+        """What would decide about a rejected pose, in words: with it, this evidence would do."""
+        near = replace(self, margin=None)
+        if self.margin is not None and not self.degenerate and near.probability >= CERTAIN:
+            return ("a guess near it",)
+        return ("another view, which overlaps both more",)
 
     def rejection_reason(self) -> str:
         """Return the reason why the pose is rejected; empty if it is accepted."""
@@ -198,6 +207,14 @@ class CloudEvidence(PoseEvidence):
             lead = max(self.surface_lead, 0.0) / (self.near_surfaces + _FEW_SURFACES)
         contradiction = min(self.contradiction / _MUCH_CONTRADICTION, 1.0)
         return np.array([1, np.sqrt(lead), not self.free_space, contradiction])
+
+    @property
+    def remedies(self) -> tuple[str, ...]:
+        """See `PoseEvidence.remedies`; also free space, if nothing is in it."""
+        seen = replace(self, free_space=True)
+        if self.free_space or self.margin is None or seen.probability < ACCEPTED:
+            return super().remedies
+        return ("points in the frames of their cameras or scanners", *super().remedies)
 
 
 def logistic(x: float) -> float:
