@@ -28,6 +28,8 @@ UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
 _NEAR_M = 1.0
 # With fewer points the noise scale, their median residual, has an error above 8 %.
 _MIN_POINTS = 200
+# Numbers of targets beyond one are rounded up to a multiple.
+_FEW_TARGETS = 4
 # Noise scales of one camera's views differ by less than this factor.
 _MAX_SCALE_RATIO = 3.0
 
@@ -275,6 +277,8 @@ def align(
         max_scale = max(3.0, options.max_sigma_m / median(sigma), _MAX_SCALE_RATIO * usual_scale)
     depth_factor = min(1.0, source.depth / _NEAR_M) if source.depth > 0 else 1.0
     images = tuple(t.view.target_image for t in targets)
+    if len(images) > 1:  # kernels are compiled for one target, and for a few
+        images += images[-1:] * (-len(images) % _FEW_TARGETS)
     T_targets = np.stack([t.T_target_world for t in targets])
     T = T0.copy()
     iterations = 0

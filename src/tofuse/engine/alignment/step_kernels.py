@@ -155,7 +155,7 @@ def iterate_level(
     Parameters
     ----------
     points, targets
-        Source points as in `accumulate`, and n targets.
+        Source points as in `accumulate`, and at least n targets, of which the first n count.
     T_targets
         (n, 4, 4) T_target_world of each target.
     T, estimates
@@ -187,7 +187,7 @@ def iterate_level(
             settings.robust,
             settings.min_cosine,
         )
-        for k in range(len(targets)):
+        for k in range(len(T_targets)):
             total += res.accumulate(points, targets[k], compose(T_targets[k], T), residuals)
         if settings.remap and iterations == 0:
             spurious = total[res.INLIERS] * spurious_information(
