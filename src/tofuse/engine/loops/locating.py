@@ -13,11 +13,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from tofuse.engine.alignment import covariance, projective
 from tofuse.engine.arrays import Float64
+from tofuse.engine.compute import one_blas_thread, run_all
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops.join_checks import JoinChecks
 from tofuse.engine.loops.merged_components import DRIFT, MergedComponents, TrackedComponent, View
@@ -39,7 +41,9 @@ _MAX_SHIFT = 0.5
 # is searched, further ones for each other view of a clip, and those in which rivals of a probable
 # pose are searched, in the range in which views of one place look similar.
 _CONSIDERED, _SEARCHED, _PER_VIEW, _RIVALS = 24, 8, 2, 2
-_NARROW = SearchOptions("auto", 0.55, 0.45, 0.25, 0.3, 8, 12, 3)
+_NARROW = SearchOptions(
+    "full", turn=0.45, roll=0.25, reach=0.3, full_candidates=12, photometric_candidates=3
+)
 # Score below which an alignment says nothing about the pose.
 _MIN_SCORE = 0.25
 # Candidates and compared map views differ by more: fraction of the depth plus rad.
@@ -54,7 +58,8 @@ _PROBE, _LEAD = 4.0, 0.05
 # Displacements along such a direction to where the agreement is best, each at most so many times.
 _SLIDES, _MAX_SLIDES = (4.0, -4.0, 2.0, -2.0, 1.0, -1.0), 6
 _ALIGNMENT = projective.ProjectiveOptions(levels=verification.PATIENT, prior_m=3.0, prior_rad=3.0)
-_COARSE_ALIGNMENT = replace(_ALIGNMENT, levels=verification.COARSE)
+# Points of each view in the alignments with these places, and in searches for rivals.
+_FEW = 800
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +197,9 @@ class Locator:
         self._fit_statistics = checks.fit_statistics
         self._max_contradiction = checks.max_contradiction
         self._tolerances = verification.usual_tolerances(checks.fit_statistics)
+        self._few_points = replace(self._tolerances, points=_FEW)
 
+    @one_blas_thread()
     def locate(self, views: Sequence[View]) -> dict[int, Location]:
         """Locate views of one clip, whose poses relative to each other are known.
 
@@ -244,17 +251,25 @@ class Locator:
         """
         places = []
         for view in views:
-            for rank, k in enumerate(self._similar(view.view)):
-                T = projective.align(
-                    view.view,
-                    self._targets([k]),
-                    self._poses[k],
-                    _COARSE_ALIGNMENT,
-                    usual_scale=self._fit_statistics.noise_scale,
-                ).T_world_source
-                places.append((rank, self._place(view, k, T)))
+            few = pair_agreement.ComparedView.of(view.view, self._few_points)
+            similar = self._similar(view.view)
+            found = run_all([partial(self._aligned_place, view, few, k) for k in similar])
+            places += list(enumerate(found))
         places.sort(key=lambda p: (-max(p[1].score, _MIN_SCORE), p[0]))
         return [place for _, place in places]
+
+    def _aligned_place(self, view: View, few: pair_agreement.ComparedView, k: int) -> _Place:
+        """Align a view, `few` of whose points are compared, with map view `k` from its pose."""
+        stride = max(1, round(float(np.sqrt(few.view.planar_fraction * few.view.z.size / _FEW))))
+        levels = tuple(replace(level, stride=stride) for level in verification.COARSE[:2])
+        other, options = self._views[k].view, replace(_ALIGNMENT, levels=levels)
+        scale = self._fit_statistics.noise_scale
+        target = projective.Target(other, np.eye(4))
+        aligned = projective.align(few.view, [target], np.eye(4), options, usual_scale=scale)
+        target_points = pair_agreement.ComparedView.of(other, self._few_points)
+        comparison = pair_agreement.Comparison(few, target_points, self._few_points)
+        T = aligned.T_world_source
+        return _Place(view, k, self._poses[k] @ T, comparison.at(T).score)
 
     def _place(self, view: View, k: int, T_map_view: Float64) -> _Place:
         return _Place(view, k, T_map_view, self._agreements(view.view, T_map_view, [k])[k].score)
@@ -305,7 +320,7 @@ class Locator:
             place.view.view,
             self._views[place.k].view,
             _NARROW,
-            agreement=self._tolerances,
+            agreement=self._few_points,
             distinct_m=DISTINCT_M,
         )
         match = None if search is None else search.exhaustive()

@@ -7,6 +7,7 @@ camera. No pose is needed.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,8 +25,8 @@ _MAX_DEPTH, _MAX_ALBEDO = 0.3, 0.5
 _MIN_ALBEDO_FRACTION = 0.2
 # Of the index of descriptors: principal components, and nearest neighbours per query.
 _COMPONENTS, _NEAREST = 8, 6
-# Descriptors that are compared with one cell by cell.
-_COMPARED = 256
+# Descriptors that are compared with one cell by cell, and shifts at which each of them is.
+_COMPARED, _COMPARED_SHIFTS = 256, 8
 
 
 def view_descriptor(view: PreparedView) -> Float32:
@@ -47,9 +48,7 @@ def view_descriptor(view: PreparedView) -> Float32:
     return descriptor.reshape(2, _ROWS, _COLUMNS)
 
 
-def dissimilarity(
-    descriptor: Float32, others: Float32, shift: float, *, exposed_alike: bool = False
-) -> Float64:
+def dissimilarity(descriptor: Float32, others: Float32, shift: float) -> Float64:
     """Return the distances (N,) between one descriptor and others, each at its best shift.
 
     0 for the same image, 1 for no similarity. The mean difference of log albedo is exposure, and
@@ -61,17 +60,29 @@ def dissimilarity(
         Descriptors (2, 9, 12) and (N, 2, 9, 12).
     shift
         Largest shift, as a fraction of the width.
-    exposed_alike
-        Whether the exposure may be the same: half the weight is on albedo as it is.
     """
-    max_u, max_v = round(shift * _COLUMNS), round(shift * _ROWS / 2)
     best = np.ones(len(others))
-    for v in range(-max_v, max_v + 1):
-        for u in range(-max_u, max_u + 1):
-            patch = descriptor[:, max(v, 0) : _ROWS + v, max(u, 0) : _COLUMNS + u]
-            other_patches = others[:, :, max(-v, 0) : _ROWS - v, max(-u, 0) : _COLUMNS - u]
-            np.minimum(best, _difference(patch, other_patches, exposed_alike), out=best)
+    for v, u in _shifts(shift):
+        np.minimum(best, _at_shift(descriptor, others, v, u), out=best)
     return best
+
+
+def _shifts(shift: float) -> list[tuple[int, int]]:
+    """Return all shifts by v rows and u columns."""
+    max_u, max_v = round(shift * _COLUMNS), round(shift * _ROWS / 2)
+    return list(itertools.product(range(-max_v, max_v + 1), range(-max_u, max_u + 1)))
+
+
+def _at_shift(
+    descriptor: Float32, others: Float32, v: int, u: int, *, exposed_alike: bool = False
+) -> Float64:
+    """Return the distances (N,) of descriptors, see `dissimilarity`, at one shift.
+
+    `exposed_alike`: the exposure may be the same; half the weight is on albedo as it is.
+    """
+    patch = descriptor[:, max(v, 0) : _ROWS + v, max(u, 0) : _COLUMNS + u]
+    other_patches = others[:, :, max(-v, 0) : _ROWS - v, max(-u, 0) : _COLUMNS - u]
+    return _difference(patch, other_patches, exposed_alike)
 
 
 def mutual_dissimilarity(descriptors: Sequence[Float32] | Float32, shift: float) -> Float64:
@@ -113,13 +124,11 @@ def similar_views(descriptors: Float32, shift: float) -> tuple[Intp, Intp]:
     axes = axes[:_COMPONENTS]
     tree = cKDTree((described - mean) @ axes.T)
     queried, matched = [], []
-    max_u, max_v = round(shift * _COLUMNS), round(shift * _ROWS / 2)
-    for v in range(-max_v, max_v + 1):
-        for u in range(-max_u, max_u + 1):
-            query = (_blocks(_shifted(descriptors, v, u)) - mean) @ axes.T
-            _, neighbours = tree.query(query, k=min(_NEAREST, n))
-            queried.append(np.repeat(np.arange(n), neighbours.shape[1]))
-            matched.append(neighbours.ravel())
+    for v, u in _shifts(shift):
+        query = (_blocks(_shifted(descriptors, v, u)) - mean) @ axes.T
+        _, neighbours = tree.query(query, k=min(_NEAREST, n))
+        queried.append(np.repeat(np.arange(n), neighbours.shape[1]))
+        matched.append(neighbours.ravel())
     a, b = np.concatenate(queried), np.concatenate(matched)
     i, j = np.minimum(a, b), np.maximum(a, b)
     nonconsecutive = j > i + 1
@@ -130,7 +139,8 @@ def similar_views(descriptors: Float32, shift: float) -> tuple[Intp, Intp]:
 class DescriptorIndex:
     """Finds the most similar ones of many descriptors (N, 2, 9, 12).
 
-    Those whose means over blocks of cells are nearest are compared cell by cell.
+    Those whose means over blocks of cells are nearest are compared cell by cell, at the shifts at
+    which they are.
     """
 
     def __init__(self, descriptors: Float32) -> None:
@@ -138,19 +148,21 @@ class DescriptorIndex:
 
     def most_similar(self, descriptor: Float32, shift: float) -> Intp:
         """Return the positions of the most similar ones, these first; see `dissimilarity`."""
-        max_u, max_v = round(shift * _COLUMNS), round(shift * _ROWS / 2)
-        shifted = [
-            _shifted(descriptor[None], v, u)
-            for v in range(-max_v, max_v + 1)
-            for u in range(-max_u, max_u + 1)
-        ]
-        query = _blocks(np.concatenate(shifted), self._blocks.mean(0))
-        # Squared distances, but for a term of the query.
-        distance = (self._blocks**2).sum(1) - 2 * query @ self._blocks.T
-        nearest = (distance + (query**2).sum(1)[:, None]).min(0).argsort(kind="stable")[:_COMPARED]
-        difference = dissimilarity(
-            descriptor, self._descriptors[nearest], shift, exposed_alike=True
-        )
+        shifts = _shifts(shift)
+        shifted = np.concatenate([_shifted(descriptor[None], v, u) for v, u in shifts])
+        query = _blocks(shifted, self._blocks.mean(0))
+        # Squared distances (shifts, N), but for a term of the descriptors.
+        distance = (query**2).sum(1)[:, None] - 2 * query @ self._blocks.T
+        nearest = (distance.min(0) + (self._blocks**2).sum(1)).argsort(kind="stable")[:_COMPARED]
+        distance = distance[:, nearest]
+        k = min(_COMPARED_SHIFTS, len(shifts)) - 1
+        is_compared = distance <= np.partition(distance, k, axis=0)[k]
+        difference = np.ones(len(nearest))
+        for (v, u), compared in zip(shifts, is_compared, strict=True):
+            rows = np.flatnonzero(compared)
+            others = self._descriptors[nearest[rows]]
+            found = _at_shift(descriptor, others, v, u, exposed_alike=True)
+            difference[rows] = np.minimum(difference[rows], found)
         return np.asarray(nearest[difference.argsort(kind="stable")])
 
 
