@@ -36,6 +36,8 @@ _COMPARED = 60
 _DEGREES = 30.0
 # Standard deviation of the logarithm of the factors.
 _SPREAD = np.log(2.0)
+# Least factor on the errors of odometry: over short motions a phone's are smaller than stated.
+_BETTER = 0.5
 # Odometry that fewer fully constrained registrations were compared with is not verified.
 _MIN_COMPARED = 10
 # Squared disagreement, in units of tracking's errors, that one in a hundred motions of independent
@@ -290,7 +292,11 @@ class OdometryEdges(Bounded, ExternalSensor):
         measured = se3.inverse(sensed.odometry[first]) @ sensed.odometry[first + 1]
         variances = self._variances(measured, sensed.times[first + 1] - sensed.times[first])
         compared = _compare(sensed, graph, variances, first)
-        scales = np.ones((2, 2)) if compared is None else compared.scales((1.0, self.limit))
+        scales = (
+            np.ones((2, 2))
+            if compared is None
+            else compared.scales((1.0, 1.0), (_BETTER, self.limit))
+        )
         if scales is None:
             text = (
                 f"the odometry differs from the tracked motion by more than {self.limit:g} times "
@@ -299,11 +305,12 @@ class OdometryEdges(Bounded, ExternalSensor):
             return SensorPriors(records=(SensorRecord("odometry", len(first), 0, None, text),))
         odometry_scale = scales[1]
         C = (variances * np.repeat(odometry_scale**2, 3))[:, :, None] * np.eye(6)
+        stated = (variances * np.repeat(np.maximum(odometry_scale, 1) ** 2, 3))[:, :, None]
         tracked = se3.inverse(graph.poses[first]) @ graph.poses[first + 1]
         tracking_covariance = _covariance_to_reference(graph)
         chi2 = _squared(
             se3.log(se3.inverse(tracked) @ measured),
-            C + tracking_covariance[first] + tracking_covariance[first + 1],
+            stated * np.eye(6) + tracking_covariance[first] + tracking_covariance[first + 1],
         )
         used = chi2 <= self.gate
         shared = compared is not None and compared.shares_errors
@@ -321,7 +328,11 @@ class OdometryEdges(Bounded, ExternalSensor):
         )
         scale = float(odometry_scale.max())
         text = f"{len(kept)} of {len(first)} steps of the odometry are used, "
-        text += "with the stated errors" if scale < 1.05 else f"with {scale:.1f} times its errors"
+        text += (
+            "with the stated errors"
+            if abs(scale - 1) < 0.05
+            else f"with {scale:.1f} times its errors"
+        )
         if shared:
             text += (
                 ", those where images don't constrain the motion: it agrees with the tracked "
@@ -366,10 +377,13 @@ class _Comparison:
     spans: Intp
     verified: bool
 
-    def scales(self, limits: tuple[float, float]) -> Float64 | None:
-        """Most likely factors on the sigmas, 1 to a limit each: registrations, odometry (2, 2).
+    def scales(
+        self, registrations: tuple[float, float], odometry: tuple[float, float]
+    ) -> Float64 | None:
+        """Most likely factors on the sigmas of registrations and of odometry (2, 2).
 
-        Each of translation and of rotation; None if they don't explain the disagreement.
+        Each of translation and of rotation, within the given limits; None if they don't explain
+        the disagreement.
         """
         misfit = self._misfit
         weight = 1 / self.spans  # about as many are independent as don't overlap
@@ -382,8 +396,8 @@ class _Comparison:
             prior = 0.5 * float((logarithms[2:] ** 2).sum()) / _SPREAD**2
             return float((weight * likelihood).sum()) + prior
 
-        high = np.log(np.repeat(limits, 2))
-        bounds = [(0.0, bound) for bound in high]
+        low, high = np.log(np.repeat([registrations, odometry], 2, axis=0)).T
+        bounds = list(zip(low, high, strict=True))
         fit = minimize(cost, 0.3 * high, method="L-BFGS-B", bounds=bounds)
         found = np.exp(fit.x).reshape(2, 2)
         median = float(np.median(_squared(misfit, self._covariances(found))))
@@ -498,7 +512,7 @@ def with_depth_scale(measured: SensorPriors, sensed: SensorData, graph: PoseGrap
     compared = _compare(sensed, graph, variances, first)
     if compared is None:
         return measured
-    found = [part.scales((_MAX_DEPTH_SCALE, 1.0)) for part in compared.by_length()]
+    found = [part.scales((1.0, _MAX_DEPTH_SCALE), (1.0, 1.0)) for part in compared.by_length()]
     translation, rotation = np.max([np.ones(2), *(s[0] for s in found if s is not None)], 0)
     return replace(measured, depth_scale=(float(translation), float(rotation)))
 
