@@ -5,12 +5,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
+from tofuse.engine.arrays import Bool, Float32, Float64, Intp, UInt8
 from tofuse.engine.fusion.atlas_kernels import NO_TRIANGLE, draw_triangles
 from tofuse.engine.fusion.cloud import NO_COLOR, has_color
 from tofuse.engine.fusion.mesh import Mesh
 
 SAMPLES = 2  # per column and per row of a pixel
+_BAND = 64  # rows that are coloured at once, for less memory
 
 
 def display_colors(colors: UInt8) -> UInt8:
@@ -57,23 +58,36 @@ def drawn(
     owner = np.full((height, width), NO_TRIANGLE, np.int32)
     place = np.zeros((height, width, 2), np.float32)
     draw_triangles(corners[order].astype(np.float32), 0.0, owner, place)
-    covered = owner != NO_TRIANGLE
-    faces, (b, c) = order[owner[covered]], place[covered].T
-    weight = np.stack([1 - b - c, b, c], -1) / depth[faces]  # interpolated in perspective
-    far = 1 / weight.sum(-1)
-    weight *= far[:, None]
+    image = np.zeros((size[1], size[0], 3), np.float32)
+    distance = np.zeros((size[1], size[0]))
+    for top in range(0, size[1], _BAND):
+        band = slice(top, min(top + _BAND, size[1]))
+        rows = slice(SAMPLES * band.start, SAMPLES * band.stop)
+        covered = owner[rows] != NO_TRIANGLE
+        if not covered.any():
+            continue
+        faces, (b, c) = order[owner[rows][covered]], place[rows][covered].T
+        weight = np.stack([1 - b - c, b, c], -1) / depth[faces]  # interpolated in perspective
+        far = 1 / weight.sum(-1)
+        samples = np.zeros((*covered.shape, 4), np.float32)
+        samples[covered, :3] = _colors(mesh, texture, faces, weight * far[:, None])
+        samples[covered, 3] = far
+        blocks = samples.reshape(-1, SAMPLES, size[0], SAMPLES, 4).mean((1, 3))
+        whole = covered.reshape(-1, SAMPLES, size[0], SAMPLES).all((1, 3))
+        image[band], distance[band] = blocks[..., :3], np.where(whole, blocks[..., 3], 0.0)
+    return image, distance
+
+
+def _colors(
+    mesh: Mesh, texture: tuple[Float32, UInt8] | None, faces: Intp, weight: Float64
+) -> Float32:
+    """Return the colours (N, 3) in triangles (N,), by the weights (N, 3) of their corners."""
     if texture is not None:
         texel = np.einsum("nk,nki->in", weight, texture[0][mesh.faces[faces]])
-        value = _sampled(texture[1], texel.astype(np.float32))
-    else:
-        assert mesh.color is not None
-        value = np.einsum("nk,nki->ni", weight, mesh.color[mesh.faces[faces]].astype(np.float32))
-    samples, distance = np.zeros((height, width, 3), np.float32), np.zeros((height, width))
-    samples[covered], distance[covered] = value, far
-    image = np.asarray(cv2.resize(samples, size, interpolation=cv2.INTER_AREA), np.float32)
-    distance = np.asarray(cv2.resize(distance, size, interpolation=cv2.INTER_AREA), np.float64)
-    whole = covered.reshape(size[1], SAMPLES, size[0], SAMPLES).all((1, 3))
-    return image, np.where(whole, distance, 0.0)
+        return _sampled(texture[1], texel.astype(np.float32))
+    assert mesh.color is not None
+    colors = np.einsum("nk,nki->ni", weight, mesh.color[mesh.faces[faces]])
+    return np.asarray(colors, np.float32)
 
 
 def _sampled(image: np.ndarray, at: Float32) -> Float32:
