@@ -42,7 +42,7 @@ from tofuse.engine.frames.recording import Recording, evenly_spaced
 from tofuse.engine.fusion import display_surface
 from tofuse.engine.fusion.tsdf import fuse_surface
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.adaptation import Prior, with_prior
+from tofuse.engine.mapping.adaptation import Prior, adapted, with_prior
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.map_agreement import map_consistency
@@ -264,10 +264,11 @@ def surfaces(scenes: list[str], seeds: int, frames: int) -> None:
     print("|---|---|---|---|---|---|---|---|")
     for scene, seed in product(scenes, range(seeds)):
         planned = plan_phone(scene, seed=seed, frames=frames)
-        with opened(replace(planned, color_every=len(planned.times))) as recording:
+        with opened(replace(planned, color_every=0)) as recording:
             images = [f for f in recording if isinstance(f, RangeFrame)]
+            config = adapted(from_method("default", "range"), recording)
         poses = planned.poses
-        views, _, _ = views_of(images, from_method("default", "range"))
+        views, _, _ = views_of(images, config)
         vertices, faces = planned.scene.truth_mesh()
         T_world_truth = planned.motion.T_world_truth(planned.times[0])
         truth = Surface(se3.transform(T_world_truth, vertices), faces)
