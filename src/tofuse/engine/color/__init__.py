@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.color.color_edges import with_color, with_edges
+    from tofuse.engine.color.color_edges import with_color
     from tofuse.engine.color.color_pairs import measured_pairs
     from tofuse.engine.color.color_views import ColorView
 

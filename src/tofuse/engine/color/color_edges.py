@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from tofuse.engine.arrays import Intp
 from tofuse.engine.color.color_pairs import measured_pairs
 from tofuse.engine.color.color_views import SEARCHES, ColorView
 from tofuse.engine.graph import Measured, Optimiser, PoseGraph, graph_covariances
@@ -38,25 +37,10 @@ def with_color(
         measured = measured_pairs(views, poses[rows], search)
         if not measured:
             return graph, ()
-        extended = with_edges(graph.with_poses(poses), measured)
+        extended = graph.with_poses(poses).with_edges(measured)
         suspected = np.arange(len(extended.edges)) >= len(graph.edges)
         done = optimiser.optimise(replace(extended, loop=suspected))
         weights = np.ones(len(suspected)) if done.weights is None else done.weights
         kept = np.flatnonzero(weights[len(graph.edges) :] >= graph_covariances.MIN_WEIGHT)
         poses, accepted = done.graph.poses, tuple(measured[k] for k in kept.tolist())
-    return with_edges(graph.with_poses(poses), accepted), accepted
-
-
-def with_edges(graph: PoseGraph, measured: Sequence[Measured]) -> PoseGraph:
-    """Return the graph with further edges, which close no loops."""
-    if not measured:
-        return graph
-    row = {int(index): k for k, index in enumerate(graph.ids)}
-    pairs: Intp = np.array([(row[m.i], row[m.j]) for m in measured], np.intp)
-    return replace(
-        graph,
-        edges=np.concatenate([graph.edges, pairs]),
-        measurements=np.concatenate([graph.measurements, [m.T_i_j for m in measured]]),
-        information=np.concatenate([graph.information, [m.information for m in measured]]),
-        loop=np.concatenate([graph.loop, np.zeros(len(measured), bool)]),
-    )
+    return graph.with_poses(poses).with_edges(accepted), accepted

@@ -524,25 +524,11 @@ def with_sensors(graph: PoseGraph, measured: SensorPriors) -> PoseGraph:
     """
     if not measured:
         return graph
-    position = {int(index): k for k, index in enumerate(graph.ids)}
-    steps = measured.steps
-    m = len(steps)
     own = graph.information
     if measured.depth_scale != (1.0, 1.0):
         own = _scaled(own, 1 / np.array(measured.depth_scale))
-    pairs = np.array([(position[s.i], position[s.j]) for s in steps], np.intp).reshape(m, 2)
-    return replace(
-        graph,
-        edges=np.concatenate([graph.edges, pairs]),
-        measurements=np.concatenate(
-            [graph.measurements, np.array([s.T_i_j for s in steps]).reshape(m, 4, 4)]
-        ),
-        information=np.concatenate(
-            [own, np.array([s.information for s in steps]).reshape(m, 6, 6)]
-        ),
-        loop=np.concatenate([graph.loop, np.zeros(m, bool)]),
-        gravity=measured.gravity_of(graph.ids.tolist()),
-    )
+    gravity = measured.gravity_of(graph.ids.tolist())
+    return replace(graph, information=own, gravity=gravity).with_edges(measured.steps)
 
 
 def _covariance_to_reference(graph: PoseGraph) -> Float64:

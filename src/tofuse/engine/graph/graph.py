@@ -123,6 +123,20 @@ class PoseGraph:
         """Return the graph with other poses."""
         return replace(self, poses=poses)
 
+    def with_edges(self, measured: Sequence[Measured]) -> PoseGraph:
+        """Return the graph with further edges, which close no loops."""
+        if not measured:
+            return self
+        row = {int(index): k for k, index in enumerate(self.ids)}
+        pairs: Intp = np.array([(row[m.i], row[m.j]) for m in measured], np.intp)
+        return replace(
+            self,
+            edges=np.concatenate([self.edges, pairs]),
+            measurements=np.concatenate([self.measurements, [m.T_i_j for m in measured]]),
+            information=np.concatenate([self.information, [m.information for m in measured]]),
+            loop=np.concatenate([self.loop, np.zeros(len(measured), bool)]),
+        )
+
     def subgraph(self, vertices: Intp, edges: Intp) -> PoseGraph:
         """Return the subgraph of vertices, and of edges between them.
 

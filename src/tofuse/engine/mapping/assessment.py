@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.color import with_edges
 from tofuse.engine.frames import RangeFrame, frame_ranges
 from tofuse.engine.fusion import Model, with_pose_errors
 from tofuse.engine.graph import LoopRecord, PoseGraph, external_sensors, graph_covariances
@@ -191,7 +190,7 @@ class Assessment:
         def assessed(
             sensors: external_sensors.SensorPriors, observed: pose_accuracy.ObservedErrors
         ) -> tuple[pose_accuracy.Accuracy, graph_covariances.GraphCovariances]:
-            graph = with_edges(external_sensors.with_sensors(measured, sensors), refined.color)
+            graph = external_sensors.with_sensors(measured, sensors).with_edges(refined.color)
             covariances = graph_covariances.GraphCovariances(graph)
             bounds = pose_accuracy.accuracy_of(covariances, observed, model.cloud.diagonal_m)
             return bounds, covariances

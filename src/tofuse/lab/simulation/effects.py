@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntFlag
 from typing import Any, Literal, Self
@@ -91,14 +92,7 @@ class Effects:
         InputError
             If there is no such effect.
         """
-        for name in names:
-            if name not in (*SWITCHES, "all"):
-                raise InputError(
-                    f"there is no effect called {name!r}",
-                    where="effects",
-                    remedy=f"use all, or some of {list(SWITCHES)}",
-                )
-        disabled = SWITCHES if "all" in names else names
+        disabled = switched_off(names, SWITCHES, "there is no effect")
         return replace(self, **{name: _disabled(name) for name in disabled})
 
 
@@ -107,6 +101,26 @@ SWITCHES = tuple(field.name for field in fields(Effects) if field.name != "noise
 
 def _disabled(name: str) -> Any:
     return False if isinstance(getattr(Effects, name), bool) else 0.0
+
+
+def switched_off(names: Sequence[str], known: Sequence[str], none: str) -> Sequence[str]:
+    """Return the errors of a simulated camera that are switched off by name; "all": every one.
+
+    `none` begins the message about a name that is not known.
+
+    Raises
+    ------
+    InputError
+        If there is no such error.
+    """
+    for name in names:
+        if name not in (*known, "all"):
+            raise InputError(
+                f"{none} called {name!r}",
+                where="effects",
+                remedy=f"use all, or some of {[*known]}",
+            )
+    return known if "all" in names else names
 
 
 class Flag(IntFlag):

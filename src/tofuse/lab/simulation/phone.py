@@ -26,6 +26,7 @@ from tofuse.engine.geometry import se3
 from tofuse.formats.files import atomic, staging
 from tofuse.formats.images import jpeg_bytes, write_png
 from tofuse.formats.poses import write_tum
+from tofuse.lab.simulation.effects import switched_off
 from tofuse.lab.simulation.truth import write_surface
 from tofuse.lab.world import Material, Scene
 from tofuse.lab.world import Sequence as Motion
@@ -105,14 +106,9 @@ class PhoneErrors:
             If there is no such error.
         """
         known = [each.name for each in fields(self)]
-        for name in names:
-            if name not in (*known, "all"):
-                raise InputError(
-                    f"a phone has no error called {name!r}",
-                    where="effects",
-                    remedy=f"use all, or some of {known}",
-                )
-        return replace(self, **dict.fromkeys(known if "all" in names else names, 0.0))
+        return replace(
+            self, **dict.fromkeys(switched_off(names, known, "a phone has no error"), 0.0)
+        )
 
 
 _DEFAULT = PhoneErrors()
