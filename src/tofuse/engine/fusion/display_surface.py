@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Intp
+from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64, Intp
 from tofuse.engine.cameras import Camera
+from tofuse.engine.compute import run_chunks
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.geometry import se3
@@ -108,22 +109,26 @@ def without_shards(mesh: Mesh, witnesses: Sequence[Witness]) -> Mesh:
     usual one, relative to the number of witnesses that look. Where none does, as witnesses are a
     sample, or the vertex is behind another surface, its number of views decides.
     """
-    looking, seeing, hidden = np.zeros(len(mesh)), np.zeros(len(mesh)), np.zeros(len(mesh), bool)
     points, normals = mesh.vertices.astype(float), mesh.normals.astype(float)
-    for witness in witnesses:
-        inside, behind = witness.looks(points, normals)
-        with np.errstate(invalid="ignore"):
-            is_hidden = inside & (behind < -1)
-            hidden |= is_hidden
-            looking += inside & ~is_hidden
-            seeing += inside & (np.abs(behind) <= 1)
+
+    def counts(first: int, last: int) -> Int64:
+        total = np.zeros((3, len(mesh)), np.int64)
+        for witness in witnesses[first:last]:
+            inside, behind = witness.looks(points, normals)
+            with np.errstate(invalid="ignore"):
+                hidden = inside & (behind < -1)
+                total += [inside & ~hidden, inside & (np.abs(behind) <= 1), hidden]
+        return total
+
+    none = np.zeros((3, len(mesh)), np.int64)
+    looking, seeing, hidden = sum(run_chunks(counts, len(witnesses)), none)
     is_looked_at = looking > 0
     share = mesh.views[is_looked_at] / looking[is_looked_at]
     usual = float(np.median(share)) if len(share) else 0.0
     few = mesh.views < _SUPPORTED * np.where(is_looked_at, usual * looking, np.median(mesh.views))
     # Those that fused views would let expect, if the surface were not behind another one.
     expected = mesh.views * (np.median(seeing) / max(float(np.median(mesh.views)), 1))
-    unseen = (seeing == 0) & (is_looked_at | (hidden & (expected >= _EXPECTED)))
+    unseen = (seeing == 0) & (is_looked_at | ((hidden > 0) & (expected >= _EXPECTED)))
     supported = ~few & ~unseen
     return mesh.rows(supported[mesh.faces].sum(1) >= 2)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, UInt8
 from tofuse.engine.cameras import ray_lengths
-from tofuse.engine.compute import run_chunks
+from tofuse.engine.compute import job_pool, run_chunks
 from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.fusion.atlas import Atlas, chart_atlas, unwrap
 from tofuse.engine.fusion.atlas_kernels import (
@@ -198,15 +198,19 @@ def textured(mesh: Mesh, views: Sequence[TextureView], poses: Float64, size: int
     size
         Maximum edge of the texture.
     """
-    seen = _Seen.of(mesh, views, poses).aligned(mesh)
-    gains = seen.exposures()
+    seen = _Seen.of(mesh, views, poses)
     candidates, label = seen.candidates(mesh.faces)
     whole = label >= 0
     pixels = seen.image_pixels(label, mesh.faces)
     observed = max(int((seen.weights > 0).any(0).sum()), 1)
     detail = float(_areas(pixels[whole]).sum()) / observed
     label[~whole], pixels[~whole] = _flattened(mesh, ~whole)
-    atlas = chart_atlas(mesh.faces, label, pixels, size)
+    # The layout needs neither the corrected poses nor the exposures.
+    with job_pool(1, "tofuse-atlas") as background:
+        laid_out = background.submit(chart_atlas, mesh.faces, label, pixels, size)
+        seen = seen.aligned(mesh)
+        gains = seen.exposures()
+        atlas = laid_out.result()
     image = _painted(mesh, seen, gains, candidates, atlas)
     area = _areas(mesh.vertices[mesh.faces])
     share = float(area[whole].sum() / max(area.sum(), 1e-30))
@@ -478,18 +482,43 @@ def _filled(image: UInt8, mask: Bool) -> UInt8:
         return image
     weights: list[Float32] = []
     levels: list[NDArray[np.floating]] = []
-    weight, color = mask.astype(np.float32), image.astype(np.float32)
-    while max(weight.shape) > 1:
-        size = [max(1, -(-n // 2)) for n in weight.shape[::-1]]
-        sums = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
-        weight = np.asarray(cv2.resize(weight, size, interpolation=cv2.INTER_AREA), np.float32)
+    sums, weight = _halved(image, mask)
+    while True:
         levels.append(sums / np.maximum(weight, 1e-6)[..., None])
         weight = np.minimum(weight * 4, np.float32(1))
         weights.append(weight)
+        if max(weight.shape) == 1:
+            break
         color = np.asarray(levels[-1] * weight[..., None], np.float32)
+        size = _half(weight.shape)
+        sums = np.asarray(cv2.resize(color, size, interpolation=cv2.INTER_AREA), np.float32)
+        weight = np.asarray(cv2.resize(weight, size, interpolation=cv2.INTER_AREA), np.float32)
     fill = levels.pop()
     for level, weight in zip(levels[::-1], weights[-2::-1], strict=True):
         fill = np.asarray(cv2.resize(fill, weight.shape[::-1]), np.float32).reshape(level.shape)
         fill += weight[..., None] * (level - fill)
     smooth = cv2.resize(np.round(fill.clip(0, 255)).astype(np.uint8), mask.shape[::-1])
     return np.asarray(cv2.copyTo(image, mask.astype(np.uint8), smooth), np.uint8)
+
+
+def _half(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Return width and height of half an image of a shape (H, W)."""
+    return max(1, -(-shape[1] // 2)), max(1, -(-shape[0] // 2))
+
+
+def _halved(image: UInt8, mask: Bool) -> tuple[Float32, Float32]:
+    """Return an image and its mask at half the size.
+
+    In bands of rows, so that the image is never in memory as floating-point numbers.
+    """
+    width, height = _half(mask.shape)
+    sums, weight = np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32)
+
+    def band(a: int, b: int) -> None:
+        for full, half in ((image, sums), (mask, weight)):
+            rows = full[2 * a : 2 * b].astype(np.float32)
+            half[a:b] = cv2.resize(rows, (width, b - a), interpolation=cv2.INTER_AREA)
+
+    # Rows of an odd number are not halved in pairs.
+    run_chunks(band, height, _CHUNKS if mask.shape[0] % 2 == 0 else 1)
+    return sums, weight

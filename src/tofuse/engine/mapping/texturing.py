@@ -8,6 +8,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from tofuse.engine.arrays import Bool
+from tofuse.engine.compute import job_pool
 from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.frames import RangeFrame, Recording, evenly_spaced
@@ -73,28 +74,31 @@ def make_texture(
     views: list[texture.TextureView] = []
     poses = []
     witnesses: list[display_surface.Witness] = []
-    for k in frame_positions:
-        progress.advance()
-        try:
-            frame = recording[int(k)]
-        except UnreadableFrameError:
-            continue
-        for corrector in correctors:
-            frame = corrector.apply(frame)
-        if not isinstance(frame, RangeFrame):
-            continue
-        witnesses.append(display_surface.Witness.of(frame, result.trajectory[k]))
-        if frame.color_image is None and not required:
-            continue
-        view = texture.TextureView.of(frame, full_image(recording, frame, most_pixels))
-        if view is not None:
-            views.append(view)
-            poses.append(result.trajectory[k])
+    # The surface is reduced while images are read.
+    with job_pool(1, "tofuse-texture") as background:
+        reduced = background.submit(mesh.clustered, _FACES)
+        for k in frame_positions:
+            progress.advance()
+            try:
+                frame = recording[int(k)]
+            except UnreadableFrameError:
+                continue
+            for corrector in correctors:
+                frame = corrector.apply(frame)
+            if not isinstance(frame, RangeFrame):
+                continue
+            witnesses.append(display_surface.Witness.of(frame, result.trajectory[k]))
+            if frame.color_image is None and not required:
+                continue
+            view = texture.TextureView.of(frame, full_image(recording, frame, most_pixels))
+            if view is not None:
+                views.append(view)
+                poses.append(result.trajectory[k])
     if not views:
         return None
     # BLAS results depend on its number of threads; those of our kernels don't.
     with use_threads(threads), threadpool_limits(1):
-        shown, filled = display_surface.displayed(mesh.clustered(_FACES), witnesses)
+        shown, filled = display_surface.displayed(reduced.result(), witnesses)
         made = replace(texture.textured(shown, views, np.array(poses), size), filled=filled)
     worthwhile = made.coverage >= _MIN_COVERAGE and made.detail >= _MIN_DETAIL
     return made if worthwhile or required else None

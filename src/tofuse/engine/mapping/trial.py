@@ -222,21 +222,20 @@ def trial(
     if len(recording) < _VIEWS + _MIN_RUNS - 1:
         return Trial((), ())
     views = _AlignedViews(recording, uncorrected, corrected)
-    stride, visited, results = 1, set(), []
+    stride = 1
+    runs_of_views: dict[tuple[int, int], tuple[list[_TrialView], Float64]] = {}
     for fraction in (k / (runs - 1) for k in range(runs)):
         last = len(recording) - 1 - (_VIEWS - 1) * stride
         start = max(0, round(fraction * last))
         stride = views.stride(start, stride)
-        if (start, stride) in visited:
-            continue
-        visited.add((start, stride))
-        result = _regressed(*views.run(start, stride))
-        if result is not None:
-            results.append(result)
+        if (start, stride) not in runs_of_views:
+            runs_of_views[start, stride] = views.run(start, stride)
+    regressed = run_all([partial(_regressed, *run) for run in runs_of_views.values()])
+    results = [run for run in regressed if run is not None]
     found = _pairs_of_sums(results, _FULL_BY_SURFACES)
     if not found.is_significant:
         return found
-    by_halves = run_all([partial(views.by_halves, *run) for run in sorted(visited)])
+    by_halves = run_all([partial(views.by_halves, *run) for run in sorted(runs_of_views)])
     second = _pairs_of_sums([run for run in by_halves if run is not None], _FULL_BY_HALVES)
     return replace(found, by_halves=second)
 

@@ -16,12 +16,13 @@ given, or estimated by `GainEstimator`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
 
 from tofuse.engine.arrays import Complex128, Float32, Float64
-from tofuse.engine.compute import run_chunks
+from tofuse.engine.compute import run_all, run_chunks
 from tofuse.engine.sensor import multipath_kernels as kernels
 from tofuse.engine.sensor.multipath_kernels import W, X, Y
 from tofuse.engine.sensor.multipath_surfaces import (
@@ -299,4 +300,4 @@ class GainEstimator:
             self._gains = bright / np.geomspace(1.4, 0.12, 9)
             self._flat = np.zeros(len(self._gains))
         self._bright.append(bright)
-        self._flat += [coarse.flatness(image, float(g)) for g in self._gains]
+        self._flat += run_all([partial(coarse.flatness, image, float(g)) for g in self._gains])

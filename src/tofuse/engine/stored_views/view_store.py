@@ -60,7 +60,7 @@ class CoarseView:
 
     def scaled(self, factor: float) -> CoarseView:
         """Return the view with its depth scaled."""
-        points, target = _scaled(self.points, self.target, factor)
+        points, target = _scaled_points(self.points, factor), _scaled_target(self.target, factor)
         return replace(self, points=points, target=target)
 
     @property
@@ -104,6 +104,9 @@ class SampledView:
         For estimates of the overlap.
     has_albedo, measures_range
         As of `PreparedView`.
+    target_scale
+        By which the depth of the target image is multiplied when it is used: the images of all
+        views are not in memory twice.
     """
 
     index: int
@@ -114,6 +117,7 @@ class SampledView:
     coarse: CoarseView
     has_albedo: bool = False
     measures_range: bool = False
+    target_scale: float = 1.0
 
     @classmethod
     def of(cls, surface: PreparedView, points: int) -> SampledView:
@@ -138,16 +142,21 @@ class SampledView:
         """Return the view with its depth scaled."""
         if factor == 1:
             return self
-        points, target = _scaled(self.points, self.target, factor)
-        coarse = self.coarse.scaled(factor)
-        return replace(self, depth=self.depth * factor, points=points, target=target, coarse=coarse)
+        return replace(
+            self,
+            depth=self.depth * factor,
+            points=_scaled_points(self.points, factor),
+            coarse=self.coarse.scaled(factor),
+            target_scale=self.target_scale * factor,
+        )
 
     @property
     def target_image(self) -> residual_kernels.TargetImage:
         """The target image and its projection."""
-        return residual_kernels.TargetImage(
-            self.target, self.projection.lookup, self.projection.frame
-        )
+        target = self.target
+        if self.target_scale != 1:
+            target = _scaled_target(target, self.target_scale)
+        return residual_kernels.TargetImage(target, self.projection.lookup, self.projection.frame)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -175,14 +184,20 @@ class SampledView:
         )
 
 
-def _scaled(points: Float32, target: Float32, factor: float) -> tuple[Float32, Float32]:
-    """Return points and a target image with their depth scaled."""
-    k, points, target = residual_kernels, points.copy(), target.copy()
+def _scaled_points(points: Float32, factor: float) -> Float32:
+    """Return points (N, POINT_SIZE) with their depth scaled."""
+    k, points = residual_kernels, points.copy()
     points[:, k.POINT : k.POINT + 3] *= factor
     points[:, k.POINT_ALBEDO_SLOPE : k.POINT_ALBEDO_SLOPE + 3] /= factor
+    return points
+
+
+def _scaled_target(target: Float32, factor: float) -> Float32:
+    """Return a target image (H, W, PIXEL_SIZE) with its depth scaled."""
+    k, target = residual_kernels, target.copy()
     target[..., k.DISTANCE] *= factor
     target[..., k.VARIANCE] *= factor**2
-    return points, target
+    return target
 
 
 def sampled_points(surface: PreparedView, count: int) -> Float32:
