@@ -96,7 +96,8 @@ def test_unobservable_directions_are_reported_and_stay_as_guessed(walls, count, 
     if remapping:
         missed, slid = remapping.across(missed), remapping.along(moved)
         np.testing.assert_allclose(slid, np.eye(4), atol=1e-3)
-    assert np.linalg.norm(se3.log(missed)) < 0.3 * noise + 2e-3
+    # An error of the rotation about the wall, 5 m away, shows as one of the position.
+    assert np.linalg.norm(se3.log(missed)) < 0.8 * noise + 2e-3
 
 
 def test_ball_does_not_constrain_rotation():

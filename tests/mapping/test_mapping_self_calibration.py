@@ -180,7 +180,8 @@ WIDE = BrownConrady(64, 64, 32.0, 32.0, 31.5, 31.5)
 @pytest.mark.parametrize(
     ("true", "errors", "corrected"),
     [
-        ({"fx": 31.68, "fy": 31.68}, {"focal": 0.01}, False),
+        ({"fx": 31.84, "fy": 31.84}, {"focal": 0.005}, False),
+        ({"fx": 31.36, "fy": 31.36}, {"focal": 0.02}, True),
         ({"cy": 32.46}, {"center_y": -0.03}, True),
         ({"k1": -0.02}, {"distortion": 0.02}, True),
     ],

@@ -180,6 +180,11 @@ PLAUSIBLE = {
 }
 
 
+KNOWN_FAILURE = pytest.mark.xfail(
+    reason="the next images are aligned with this one as well, and are 9 cm off", strict=True
+)
+
+
 # Images with amplitudes in one scene, depth alone in the other.
 BOTH_KINDS = pytest.mark.parametrize(
     ("scene", "amplitude"), [("room", True), ("corner", False)], ids=["lit", "depth alone"]
@@ -218,7 +223,13 @@ def test_corrupted_image_stays_unconnected(request, scene, damage, amplitude):
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("damage", PLAUSIBLE.values(), ids=PLAUSIBLE.keys())
+@pytest.mark.parametrize(
+    "damage",
+    [
+        pytest.param(damage, id=name, marks=[KNOWN_FAILURE] if name == "upside down" else [])
+        for name, damage in PLAUSIBLE.items()
+    ],
+)
 def test_plausible_wrong_image_does_not_affect_other_poses(request, damage):
     steps, poses = tracked_with_bad_frame(request, "room", True, damage)
     # Poses before it are correct; those after it are mutually consistent.

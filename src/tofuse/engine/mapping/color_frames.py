@@ -19,7 +19,6 @@ from tofuse.engine.stored_views import Spacing, ViewStore
 
 # Wider than for depth: colour constrains far pairs, and frames in between follow by depth.
 _SPACING = Spacing(angle=0.08, distance=0.05, max_views=60)
-_MOST_PIXELS = 1_000_000
 _USUAL_RATE_HZ = 30.0
 
 
@@ -63,7 +62,7 @@ class ColorFrames:
             except InputError:  # no longer readable
                 continue
             assert isinstance(frame, RangeFrame)
-            full = full_image(self.recording, frame, _MOST_PIXELS)
+            full = full_image(self.recording, frame)
             color = frame.color_image if full is None else full
             for corrector in self.correctors:
                 frame = corrector.apply(frame)
@@ -86,8 +85,13 @@ class ColorFrames:
         }
 
 
-def full_image(recording: Recording, frame: RangeFrame, most_pixels: int) -> UInt8 | None:
-    """Return the colour of a frame as recorded, if it is finer than that at the depth's size."""
+def full_image(
+    recording: Recording, frame: RangeFrame, most_pixels: int | None = None
+) -> UInt8 | None:
+    """Return the colour of a frame as recorded, if it is finer than that at the depth's size.
+
+    Reduced to at most so many pixels.
+    """
     source, index = origin_of(recording.source, frame.index)
     read = getattr(source, "full_resolution_color", None)
     if read is None or frame.color_image is None:
@@ -98,6 +102,8 @@ def full_image(recording: Recording, frame: RangeFrame, most_pixels: int) -> UIn
         return None
     if image is None or len(image) <= len(frame.color_image):
         return None
+    if most_pixels is None:
+        return image
     step = int(np.ceil(np.sqrt(image.shape[0] * image.shape[1] / max(most_pixels, 1))))
     if step == 1:
         return image
