@@ -1,7 +1,7 @@
 """Localisation in a finished map: frames of sessions that it has not seen, and of other buildings.
 
 The building and the walk are those of `hours.py`. The map is the result of a run on one walk.
-Poses are right if they are so relative to the nearest frame of the map, as errors of the map are
+Poses are right if they are so relative to the frames of the map around them, as errors of the map are
 not those of locating. Located in it are single frames of another walk through the same rooms, moved
 and turned by 10 cm and 5 degrees more ("near" the path of the map) or 40 cm and 20 degrees ("far"),
 clips of ten frames of that walk, and both in a building of the same plan with other materials and
@@ -44,6 +44,7 @@ ROWS = (
     ("another building", 99, 0.1, np.radians(5)),
 )
 CLIP = 10
+AROUND = 15  # frames of the map
 
 
 def images(scene: Scene, poses: Float64, seed: int) -> list[RangeFrame]:
@@ -83,17 +84,20 @@ def made_map(rooms: int, frames: int, seed: int) -> Path:
 
 
 def in_map(poses: Float64, trajectory: Float64, walk: Float64) -> Float64:
-    """True poses (M, 4, 4) in a map, as they are relative to its nearest frames.
+    """True poses (M, 4, 4) in a map, as they are relative to its frames around them.
 
-    Of these `trajectory` (N, 4, 4) are the poses in the map, and `walk` the true ones.
+    Of these `trajectory` (N, 4, 4) are the poses in the map, and `walk` the true ones. Single
+    frames of a map may have slid: of the poses that the nearest ones say, the most central counts.
     """
     posed = np.isfinite(trajectory).all((1, 2))
     trajectory, walk = trajectory[posed], walk[posed]
     result = []
     for T in poses:
         shift, turn = se3.lengths(se3.inverse(walk) @ T).T
-        k = int(np.argmin(shift + turn))
-        result.append(trajectory[k] @ se3.inverse(walk[k]) @ T)
+        near = np.argsort(shift + turn)[:AROUND]
+        said = trajectory[near] @ se3.inverse(walk[near]) @ T
+        apart = np.linalg.norm(said[:, None, :3, 3] - said[None, :, :3, 3], axis=2)
+        result.append(said[int(np.argmin(apart.sum(1)))])
     return np.stack(result)
 
 

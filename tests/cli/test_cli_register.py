@@ -311,3 +311,14 @@ def test_verification_sets_exit_status(
     assert again == status
     assert output["believed"] is more.get("believed")
     assert output["runner_up"] is output["margin"] is output["overlap"] is None
+
+
+def test_risk_rejects_what_is_less_certain(clouds, capfd) -> None:
+    status, data = register_json(capfd, *clouds, "--risk", "0.1")
+    assert status == 0
+    wrong = 1 - data["probability"]
+    status, strict = register_json(capfd, *clouds, "--risk", f"{0.9 * wrong:.6f}")
+    assert status == 3
+    assert strict["T_target_source"] == data["T_target_source"]
+    assert "above the accepted" in strict["reason"]
+    refuses(capfd, "register", *clouds, "--risk", "0.5", says=("--risk", "between 0 and 0.1"))

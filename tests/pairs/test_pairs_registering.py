@@ -167,3 +167,18 @@ def test_damaged_meshes_are_refused(suffix, tmp_path) -> None:
         tofuse.register(path, stone(1500, 0))
     assert str(raised.value).startswith(str(path))
     assert "\n" not in str(raised.value)
+
+
+def test_pose_is_accepted_at_a_stated_risk() -> None:
+    source, target = stone(3000, 1), stone(3000, 0)
+    found = tofuse.register(source, target)
+    assert found.believed
+    assert 0.9 <= found.probability < 1
+    wrong = 1 - found.probability
+    assert tofuse.register(source, target, risk=1.01 * wrong).believed
+    rejected = tofuse.register(source, target, risk=0.99 * wrong)
+    assert not rejected.believed
+    assert "above the accepted" in rejected.reason
+    np.testing.assert_array_equal(rejected.T_target_source, found.T_target_source)
+    with pytest.raises(tofuse.TofuseError, match=r"risk: is 0\.2"):
+        tofuse.register(source, target, risk=0.2)

@@ -327,6 +327,8 @@ class Register(Json, Threads, Source):
         registration method, such as icp (any-pair)
     scale
         the source is of unknown scale, as models from images alone are
+    risk : P
+        probability with which an accepted pose may be wrong, up to 0.1 (0.1)
     out : DIR
         folder for the result (none)
     overwrite
@@ -344,6 +346,7 @@ class Register(Json, Threads, Source):
     guess: Path | None = None
     method: str | None = None
     scale: bool = False
+    risk: float = 0.1
     out: Path | None = None
     overwrite: bool = False
 

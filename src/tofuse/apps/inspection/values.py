@@ -157,8 +157,8 @@ def check_flying(sample: Sample) -> Iterator[Finding]:
             "flying_pixels",
             f"{fraction:.1%} of the pixels are flying pixels between near and far surfaces: edges "
             f"are {width:.1f} pixels wide.",
-            "Keep the filters against flying pixels on. Some cameras smooth their depth, as phones do; if "
-            "this one does not, clean the lens and check its focus.",
+            "Keep the filters against flying pixels on. Phones and some other cameras smooth their "
+            "depth; if this one does not, clean the lens and check its focus.",
             {"flying_fraction": fraction, "edge_width_px": width},
         )
 

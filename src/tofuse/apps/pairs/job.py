@@ -9,7 +9,14 @@ from time import perf_counter
 
 from threadpoolctl import threadpool_limits
 
-from tofuse.apps.pairs.registering import registered_near, registered_scaled, registrar_of
+from tofuse.apps.pairs.registering import (
+    MAX_RISK,
+    RISKS,
+    at_risk,
+    registered_near,
+    registered_scaled,
+    registrar_of,
+)
 from tofuse.apps.pairs.result import (
     CONTRACT,
     MARKER,
@@ -23,6 +30,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds import NearOrigin
 from tofuse.engine.compute import threads
 from tofuse.engine.errors import InputError
+from tofuse.engine.parts import check_number
 from tofuse.engine.progress import Progress, Silent
 from tofuse.formats.files import atomic
 from tofuse.formats.poses import pose_text, read_pose
@@ -41,6 +49,8 @@ class PairOptions:
         Name of a registration method; None for `AnyPair`.
     scale
         Whether the source is of unknown scale.
+    risk
+        Largest probability, up to `MAX_RISK`, with which an accepted pose may be wrong.
     out
         Folder for the result; None writes none.
     overwrite
@@ -54,6 +64,7 @@ class PairOptions:
     guess: Path | None = None
     method: str | None = None
     scale: bool = False
+    risk: float = MAX_RISK
     out: Path | None = None
     overwrite: bool = False
     format: str | None = None
@@ -77,6 +88,7 @@ def register_files(
         If the result can't be written; existing files are then unchanged.
     """
     options, progress = options or PairOptions(), progress or Silent()
+    check_number(options.risk, RISKS, "--risk")
     with threads(options.threads), threadpool_limits(1):
         progress.stage("opening")
         guess = None if options.guess is None else read_pose(options.guess)
@@ -111,6 +123,7 @@ def _registered(
     name = None if options.guess is None else str(options.guess)
     near_source = replace(views[0], frame=near.source)
     near_target = replace(views[1], frame=near.target)
+    registration = at_risk(registration, options.risk)
     return PairResult(near_source, near_target, registration, name, seconds)
 
 

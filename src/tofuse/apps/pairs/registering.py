@@ -17,9 +17,13 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number, discover, name_of, registered
+from tofuse.engine.search import pose_probability
 
 # Packages with registration methods.
 _METHODS = ("tofuse.engine.icp", "tofuse.engine.clouds", "tofuse.lab.methods")
+# Risks that poses are accepted at: the engine rejects those beyond the largest.
+MAX_RISK = round(1 - pose_probability.ACCEPTED, 6)
+RISKS = Bounds(0, MAX_RISK)
 
 
 def register(
@@ -29,6 +33,7 @@ def register(
     guess: ArrayLike | None = None,
     method: Registrar | str | None = None,
     scale: bool = False,
+    risk: float = MAX_RISK,
     seed: int = 0,
 ) -> Registration:
     """Register two views, clouds, meshes or results.
@@ -57,6 +62,9 @@ def register(
         Whether the source is of unknown scale, as models from images alone are. Then `scale` is the
         factor of its points before `T_target_source` is applied, between a fourth and four times
         that of equal extents, and `scale_sigma` its standard deviation; seconds.
+    risk
+        Largest probability, up to 0.1, with which a pose that is `believed` may be wrong. As most
+        are nearly certain, a hundredth of those with less than 0.1 is expected to be wrong.
     seed
         Seed of the random selection of points, for methods that use one.
 
@@ -75,19 +83,30 @@ def register(
     ------
     InputError
         If a view can't be used or has fewer than ten finite points, the guess is no rigid motion,
-        or there is no such method; if `scale` is combined with a guess or a method.
+        there is no such method, or the risk is out of range; if `scale` is combined with a guess
+        or a method.
     RegistrationError
         If too few points correspond, clouds fit at no scale, an image is empty, or the median
         depths of two images differ more than fourfold.
     """
     check_number(seed, Bounds(0), "seed", whole=True)
+    check_number(risk, RISKS, "risk")
     start = None if guess is None else se3.check_pose(guess, where="guess")
     near = NearOrigin.of(view_of(source, "source"), view_of(target, "target"), start)
     if scale:
         near, registration = registered_scaled(near, method, seed)
     else:
         registration = registered_near(near, registrar_of(method), seed)
-    return near.in_files(registration)
+    return near.in_files(at_risk(registration, risk))
+
+
+def at_risk(registration: Registration, risk: float) -> Registration:
+    """Reject an accepted pose that is wrong with a larger probability than the accepted risk."""
+    probability = registration.probability
+    if not registration.believed or probability is None or 1 - probability <= risk:
+        return registration
+    reason = f"wrong with a probability of {1 - probability:.1%}, above the accepted {risk:.1%}"
+    return replace(registration, believed=False, reason=reason)
 
 
 def registrar_of(method: Registrar | str | None) -> Registrar:
