@@ -1,8 +1,8 @@
 """Localisation in a finished map: frames of sessions that it has not seen, and of other buildings.
 
 The building and the walk are those of `hours.py`. The map is the result of a run on one walk.
-Poses are right if they are so relative to the frames of the map around them, as errors of the map are
-not those of locating. Located in it are single frames of another walk through the same rooms, moved
+Poses are right if they are so relative to the frames of the map around them, as errors of the map
+are not those of locating. Located in it are single frames of another walk through the same rooms, moved
 and turned by 10 cm and 5 degrees more ("near" the path of the map) or 40 cm and 20 degrees ("far"),
 clips of ten frames of that walk, and both in a building of the same plan with other materials and
 furniture, in which every pose is wrong. Printed: the share within 5 cm, that which is accepted,

@@ -321,4 +321,4 @@ def test_risk_rejects_what_is_less_certain(clouds, capfd) -> None:
     assert status == 3
     assert strict["T_target_source"] == data["T_target_source"]
     assert "above the accepted" in strict["reason"]
-    refuses(capfd, "register", *clouds, "--risk", "0.5", says=("--risk", "between 0 and 0.1"))
+    refuses(capfd, "register", *clouds, "--risk", "0.5", says=("--risk", "0 to 0.1"))
