@@ -14,10 +14,13 @@ import tofuse
 from cli_calls import call, listing, refuses
 from made_rooms import CAMERA, OTHER, at, seen
 from made_sessions import HERE
+from tofuse.apps.jobs import locating
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
+from tofuse.engine.mapping import clips
+from tofuse.engine.progress import Silent
 from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.native import RecordingWriter
@@ -116,6 +119,48 @@ def test_clip_is_located_as_a_whole(session_results, clip, tmp_path, capfd) -> N
     for frame, T in zip(data["frames"], poses, strict=True):
         assert np.allclose(frame["T_world_camera"], T)
         assert len(frame["covariance"]) == 36
+
+
+def slid(tracked, frame: int, shift_m: float):
+    """Clips whose poses slide along x at a frame, as before a bare wall, where tracking says so."""
+    (clip,), lost = tracked
+    slide = se3.exp([shift_m, 0, 0, 0, 0, 0])
+    for k, T in clip.poses.items():
+        clip.poses[k] = T @ slide if k >= frame else T
+    clip.unobservable[frame] = np.eye(6)[:1]
+    return [clip], lost
+
+
+@pytest.mark.parametrize(("shift_m", "fits"), [(0.05, True), (2.0, False)])
+def test_frames_beyond_degenerate_tracking_are_aligned_with_the_map(
+    here, clip, monkeypatch, shift_m, fits
+) -> None:
+    original = clips.tracked_clips
+    monkeypatch.setattr(clips, "tracked_clips", lambda *a: slid(original(*a), 3, shift_m))
+    monkeypatch.setattr(locating, "_LOCATED", 1)  # one frame, from which all others are carried
+    located = here._map.locate_clip(tofuse.open(clip), Silent())
+    assert [frame.accepted for frame in located] == [True] * 3 + [fits] * 3
+    for frame, true in zip(located, AGAIN, strict=True):
+        if frame.accepted:
+            assert error_m(frame.location.T_map_camera, true) < 0.02
+        else:
+            assert "does not constrain" in frame.reason
+            assert len(frame.location.unobservable) == 1
+            assert se3.largest_sigmas(frame.location.covariance)[0] > 1
+
+
+def test_motion_in_a_clip_knows_what_tracking_did_not_constrain() -> None:
+    clip = clips.Clip({k: at(0.1 * k, 0, 0, 0.3 * k, 0) for k in range(4)})
+    clip.unobservable[2] = np.eye(6)[2:3]
+    for start, end, count in ((0, 1, 0), (2, 3, 0), (0, 2, 1), (3, 0, 1), (1, 3, 1)):
+        T, free = clip.motion(start, end)
+        np.testing.assert_allclose(clip.poses[start] @ T, clip.poses[end], atol=1e-12)
+        assert free.shape == (count, 6)
+    # What moves frame 2 along its axis moves frame 3 along the same line.
+    _, free = clip.motion(0, 3)
+    moved = clip.poses[3] @ se3.exp(1e-3 * free[0]) @ se3.inverse(clip.poses[3])
+    same = clip.poses[2] @ se3.exp(1e-3 * np.eye(6)[2]) @ se3.inverse(clip.poses[2])
+    np.testing.assert_allclose(moved, same, atol=1e-12)
 
 
 def test_one_frame_of_a_recording(session_results, clip, capsys) -> None:

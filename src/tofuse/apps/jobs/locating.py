@@ -189,7 +189,8 @@ class ResultMap:
         """Return the locations of the frames of a clip, each from the nearest located one.
 
         Those that are not accepted are passed over, but where tracking must have drifted: they are
-        elsewhere than an accepted one and the motion in between say.
+        elsewhere than an accepted one and the motion in between say. Frames to which tracking did
+        not constrain the motion are aligned with the map.
         """
         views = clip.store.views
         chosen = [views[k] for k in evenly_spaced(np.arange(len(views)), _LOCATED)]
@@ -198,9 +199,9 @@ class ResultMap:
         accepted = {k: location for k, location in located.items() if location.accepted}
 
         def carried(index: int, locations: dict[int, locating.Location]) -> locating.Location:
-            k = min(locations, key=lambda other: abs(other - index))
-            T_view_frame = se3.inverse(clip.poses[k]) @ clip.poses[index]
-            return locations[k].carried(T_view_frame, depths[k])
+            motions = {k: clip.motion(k, index) for k in locations}
+            k = min(motions, key=lambda k: (len(motions[k][1]) > 0, abs(k - index)))
+            return locations[k].carried(*motions[k], depths[k])
 
         if accepted:
             located = accepted | {
@@ -213,7 +214,16 @@ class ResultMap:
                     pose_probability.RIGHT_RAD,
                 )
             }
-        return {index: carried(index, located) for index in clip.poses} if located else {}
+        if not located:
+            return {}
+        found = {index: carried(index, located) for index in clip.poses}
+        for view in views:
+            near = found[view.index]
+            if accepted and not near.accepted:
+                aligned = self.locator.follow(view, near)
+                if aligned is not None and aligned.accepted:
+                    found[view.index] = aligned
+        return found
 
     def _config_of(self, frame: Frame | None, recording: Recording | None = None) -> Config:
         """Return how a frame is corrected: as those of the map if it is of the same camera."""

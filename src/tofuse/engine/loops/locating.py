@@ -94,20 +94,26 @@ class Location:
         """Whether the pose is accepted."""
         return not self.reason
 
-    def carried(self, T_view_other: Float64, depth: float) -> Location:
+    def carried(self, T_view_other: Float64, free: Float64, depth: float) -> Location:
         """Return the location of another view of the clip, given its relative pose (4, 4).
 
-        Its covariance includes the drift of tracking between views of this depth, m.
+        Its covariance includes the drift of tracking between views of this depth, m. `free` (k, 6)
+        are directions that tracking did not constrain: with any, it is not accepted.
         """
         A = se3.adjoint(se3.inverse(T_view_other))
         shift, angle = se3.lengths(T_view_other[None])[0] * DRIFT
         sigma = np.repeat([shift + angle * depth, angle + shift / depth], 3)
         rival = self.runner_up
+        free = free / np.maximum(np.linalg.norm(free, axis=1, keepdims=True), 1e-12)
+        drifted = "tracking from the nearest located frame does not constrain all directions"
         return replace(
             self,
             T_map_camera=self.T_map_camera @ T_view_other,
-            covariance=A @ self.covariance @ A.T + np.diag(sigma**2),
-            unobservable=self.unobservable @ A.T,
+            covariance=A @ self.covariance @ A.T
+            + np.diag(sigma**2)
+            + _ALIGNMENT.prior_m**2 * free.T @ free,
+            unobservable=np.concatenate([self.unobservable @ A.T, free]),
+            reason=self.reason or (drifted if len(free) else ""),
             runner_up=None if rival is None else rival @ T_view_other,
         )
 
@@ -234,6 +240,21 @@ class Locator:
                     hypotheses.append(_Hypothesis(T, placed))
             log_odds = [self._log_odds(h, hypotheses, aligned) for h in hypotheses]
         return self._locations(views, hypotheses, log_odds, searched)
+
+    @one_blas_thread()
+    def follow(self, view: View, near: Location) -> Location | None:
+        """Align a view with the map from a pose nearby; None if it does not fit there.
+
+        `near` is that pose, from other views of its clip.
+        """
+        T_map_clip = near.T_map_camera @ se3.inverse(view.T_component_camera)
+        placed = self._placed(view, T_map_clip)
+        if placed is None:
+            return None
+        hypothesis = _Hypothesis(T_map_clip, {view.index: placed})
+        own = _probability([self._log_odds(hypothesis, [hypothesis], {view.index: ()})], 1)
+        found = self._location(view, hypothesis, None, min(near.probability, own))
+        return replace(found, runner_up=near.runner_up)
 
     def _probable(
         self, hypotheses: Sequence[_Hypothesis], log_odds: Sequence[float], searched: int

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.frames import Frame, RangeFrame, Recording
+from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.preparation import Preparation
 from tofuse.engine.mapping.reconstructing import past_frames
@@ -94,12 +97,31 @@ class Clip:
     ----------
     poses
         (4, 4) T_clip_camera by frame index.
+    unobservable
+        (k, 6) directions of the right perturbation that tracking did not constrain, by the index of
+        the frames where there are any.
     store
         Views spaced by motion.
     """
 
     poses: dict[int, Float64] = field(default_factory=dict)
+    unobservable: dict[int, Float64] = field(default_factory=dict)
     store: ViewStore[PreparedView] = field(default_factory=lambda: ViewStore(Spacing()))
+
+    def motion(self, start: int, end: int) -> tuple[Float64, Float64]:
+        """Return T_start_end (4, 4) of two frames, and the directions that it does not constrain.
+
+        The latter (k, 6) are those of tracking between them, as right perturbations of the motion.
+        """
+        T_end = se3.inverse(self.poses[end])
+        first, last = sorted((start, end))
+        directions = [
+            d @ se3.adjoint(T_end @ self.poses[k]).T
+            for k, d in self.unobservable.items()
+            if first < k <= last
+        ]
+        T = se3.inverse(self.poses[start]) @ self.poses[end]
+        return T, np.concatenate([np.zeros((0, 6)), *directions])
 
 
 def tracked_clips(
@@ -122,6 +144,10 @@ def tracked_clips(
             continue
         clip = clips.setdefault(step.component, Clip())
         clip.poses[index] = step.T_component_camera
+        if step.status == "predicted":
+            clip.unobservable[index] = np.eye(6)
+        elif step.registration is not None and len(step.registration.unobservable):
+            clip.unobservable[index] = step.registration.unobservable
         clip.store.push(
             step.surface, step.T_component_camera, reduced=lambda v: v.subsampled(_COLUMNS)
         )
