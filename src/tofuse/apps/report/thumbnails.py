@@ -16,7 +16,7 @@ from tofuse.engine.geometry import se3
 # A grey that differs from both ends of the colour map.
 NO_MEASUREMENT = (128, 128, 132)
 REMOVED = (225, 40, 135)  # removed by the filter shown; not in the colour map
-BACKGROUND = (22, 25, 30)  # of the 3D view
+BACKGROUND = (29, 33, 40)  # that of the stage of the 3D view, #1d2128
 _SPLATS = 60_000  # points of a cloud that are drawn, at least
 _MIN_DEPTH = 0.02  # of the eye's distance; nearer points are not drawn
 
