@@ -45,8 +45,10 @@ from tofuse.engine.search import pose_probability
 
 # Maximum number of points of each averaged view.
 _POINTS = 7_000
-# Number of proposals that are aligned at full resolution.
-_MAX_REFINED = 3
+# Number of proposals that are aligned at full resolution, and if none of these is likely.
+_MAX_REFINED, _MANY_REFINED = 3, 12
+# Weight of the log of the matches in the rank of a pose, relative to that of its surfaces.
+_MATCH_RANK = 0.5
 # Poses that differ by more resolutions, or rad, are distinct hypotheses.
 _DISTINCT, _DISTINCT_RAD = 4.0, 0.0873
 # A pose near the guess is preferred to one with a lead below this fraction of the points.
@@ -87,6 +89,17 @@ class _Pose:
     def score(self) -> float:
         """Score of the agreement, and of the matches."""
         return self.agreement.score + MATCH_WEIGHT * float(log_matches(self.matches))
+
+    @property
+    def rank(self) -> float:
+        """Log of the distinct surfaces that coincide, less what contradicts them; and of matches.
+
+        Walls and floors coincide in many poses, however many points are on them.
+        """
+        agreement = self.agreement
+        uncontradicted = max(agreement.score, 0.0) / max(agreement.support, 1e-9)
+        surfaces = agreement.surfaces * min(uncontradicted, 1.0)
+        return float(np.log1p(surfaces) + _MATCH_RANK * log_matches(self.matches))
 
 
 # Placeholder for the rival of a pose without one; it has no support.
@@ -290,6 +303,26 @@ def _registered_views(
     )
     proposed, found = _proposed(views, start, guessed=guess is not None)
     poses += proposed
+    best = _best(views, poses, found, local, guess, certain)
+    more = [] if found is None else found.poses[_MAX_REFINED:_MANY_REFINED]
+    if more and (best.probability or 0.0) < _LIKELY:
+        poses += [views.refined(c.T_target_source) for c in more]
+        best = _best(views, poses, found, local, guess, certain)
+    return views.with_information(best)
+
+
+def _best(
+    views: _CloudViews,
+    poses: list[_Pose],
+    found: Candidates | None,
+    local: _Pose,
+    guess: Float64 | None,
+    certain: Registration | None,
+) -> Registration:
+    """Return the registration at the best of the poses.
+
+    `local` is the pose reached from the guess, and `certain` the registration there, if it is.
+    """
     poses = _ranked(poses, found)
     if guess is None:
         poses = _ranked([*poses, *_turned(views, poses[0])], found)
@@ -301,17 +334,17 @@ def _registered_views(
     if certain is not None and registration.believed:
         T = registration.T_target_source
         if not views.are_distinct_poses(T, certain.T_target_source):
-            return views.with_information(certain)
+            return certain
     if guess is None or best.guess is not None or not len(registration.unobservable):
-        return views.with_information(registration)
+        return registration
     # If the poses differ along degenerate directions only, these keep the guess.
     remapping = Remapping.of(
         registration.unobservable, views.source_map.view.points.astype(np.float64)
     )
     across = remapping.across(se3.inverse(local.T_target_source) @ registration.T_target_source)
     if views.are_distinct_poses(local.T_target_source, local.T_target_source @ across):
-        return views.with_information(registration)
-    return views.with_information(_registration(views, local, [best]))
+        return registration
+    return _registration(views, local, [best])
 
 
 def _certain(views: _CloudViews, local: _Pose) -> Registration | None:
@@ -426,11 +459,11 @@ def _proposed(
 
 
 def _ranked(poses: list[_Pose], found: Candidates | None) -> list[_Pose]:
-    """Return poses with the feature matches that agree with them, the highest score first."""
+    """Return poses with the feature matches that agree with them, the highest rank first."""
     if found is not None:
         matches = found.matches_at(np.array([pose.T_target_source for pose in poses]))
         poses = [replace(p, matches=float(count)) for p, count in zip(poses, matches, strict=True)]
-    return sorted(poses, key=lambda pose: -pose.score)
+    return sorted(poses, key=lambda pose: -pose.rank)
 
 
 def _turned(views: _CloudViews, pose: _Pose) -> list[_Pose]:
@@ -571,5 +604,8 @@ def _registration(
         p for p in poses or () if views.are_distinct_poses(p.T_target_source, pose.T_target_source)
     ]
     evidence = views.evidence(pose, lead, len(registration.unobservable), rivals)
+    by_score = max(poses or [best], key=lambda p: p.score).T_target_source
+    if views.are_distinct_poses(by_score, best.T_target_source):
+        evidence = replace(evidence, surface_lead=0.0)  # the measures contradict each other
     runner_up = None if rival is None or rival is _NO_RIVAL else rival.T_target_source
     return evidence.applied(registration, agreement, runner_up)
