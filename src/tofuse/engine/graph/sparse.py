@@ -29,6 +29,8 @@ from tofuse.engine.graph import supernode_kernels as kernels
 _MAX_RHS = 4_000_000
 # Maximum size of a factor, in numbers (160 MB), see `sparsify`.
 MAX_FACTOR = 20_000_000
+# Poses whose factor is laid out at once, without trying fewer pairs first.
+_FEW_POSES = 5000
 _MIN_SCALE = 1e-12  # minimum scale of the damping, relative to the largest diagonal entry
 
 
@@ -81,17 +83,15 @@ class PairSystem:
         self._build_sums(i, j, both_free)
 
     def _build_sums(self, i: Intp, j: Intp, both_free: Intp) -> None:
-        """Build the matrices that sum the contributions of pairs to each block."""
-        n, m = len(self.free), len(self.pairs)
-        self._sum_i = _indicator(self.block_of_pose[i], n, m)
-        self._sum_j = _indicator(self.block_of_pose[j], n, m)
+        """Find the block that each contribution of a pair is added to."""
+        n = len(self.free)
+        self._block_i, self._block_j = self.block_of_pose[i], self.block_of_pose[j]
         a, b = self.block_of_pose[i[both_free]], self.block_of_pose[j[both_free]]
         self.both_free, self.swapped = both_free, a > b
         lower, upper = np.maximum(a, b), np.minimum(a, b)
         keys, block_of_pair = np.unique(upper * max(n, 1) + lower, return_inverse=True)
         self.columns, self.rows = np.divmod(keys, max(n, 1))
         self.block_of_pair = block_of_pair
-        self._sum_below = _indicator(block_of_pair, len(keys), len(both_free))
 
     @cached_property
     def panels(self) -> tuple[kernels.Panels, Intp]:
@@ -122,9 +122,8 @@ class PairSystem:
         unary
             (n, k, k) blocks and (n, k) gradients of unary terms.
         """
-        n, k = len(self.free), self.size
-        diagonal = self._sum_i @ ii.reshape(-1, k * k) + self._sum_j @ jj.reshape(-1, k * k)
-        diagonal = diagonal.reshape(n, k, k)
+        n = len(self.free)
+        diagonal = _summed(self._block_i, ii, n) + _summed(self._block_j, jj, n)
         gradient = self.summed(g_i, g_j)
         if unary is not None:
             diagonal = diagonal + unary[0][self.free]
@@ -132,7 +131,7 @@ class PairSystem:
         # Blocks below the diagonal: rows belong to the pose that is eliminated later.
         blocks = ij[self.both_free]
         below_blocks = np.where(self.swapped[:, None, None], blocks, np.swapaxes(blocks, 1, 2))
-        below = (self._sum_below @ below_blocks.reshape(-1, k * k)).reshape(-1, k, k)
+        below = _summed(self.block_of_pair, below_blocks, len(self.rows))
         return Blocks(diagonal, below), gradient
 
     def relative(
@@ -156,7 +155,8 @@ class PairSystem:
 
     def summed(self, g_i: Float64, g_j: Float64) -> Float64:
         """Return only the gradient (free poses x k) of (m, k) g_i and g_j, as in `assemble`."""
-        return np.asarray(self._sum_i @ g_i + self._sum_j @ g_j, np.float64)
+        n = len(self.free)
+        return _summed(self._block_i, g_i, n) + _summed(self._block_j, g_j, n)
 
     def solve(
         self,
@@ -333,11 +333,12 @@ def first_of_parts(n: int, pairs: Intp) -> Bool:
     return first
 
 
-def _indicator(rows: Intp, n: int, m: int) -> sparse.csr_matrix:
-    """Make an (n, m) matrix that adds column k to row rows[k]; rows below 0 are ignored."""
-    used = np.flatnonzero(rows >= 0)
-    ones = np.ones(len(used))
-    return sparse.csr_matrix((ones, (rows[used], used)), shape=(n, m))
+def _summed(rows: Intp, values: Float64, count: int) -> Float64:
+    """Return sums (count, ...) of values (m, ...), each added to its row; none to rows below 0."""
+    width = int(np.prod(values.shape[1:]))
+    sums = np.zeros((count, width))
+    kernels.add_rows(rows, np.ascontiguousarray(values).reshape(len(values), width), sums)
+    return sums.reshape(count, *values.shape[1:])
 
 
 def _panels(n: int, rows: Intp, columns: Intp, size: int) -> kernels.Panels:
@@ -397,8 +398,8 @@ def sparsify(n: int, pairs: Intp) -> Bool:
         kept[others[:count]] = True
         return factor_size(n, np.stack([low[kept], high[kept]], 1)) <= MAX_FACTOR
 
-    # All at once, if a dense factor of one end of each would fit.
-    at_once = len(others) ** 2 <= 2 * max_blocks
+    # All at once, if a dense factor of one end of each would fit, or takes little time to reject.
+    at_once = len(others) ** 2 <= 2 * max_blocks or n <= _FEW_POSES
     chosen[others[: _largest(len(others), fits, len(others) if at_once else 0)]] = True
     return np.asarray(chosen[of_pair], np.bool_)
 

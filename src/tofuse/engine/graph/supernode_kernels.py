@@ -47,6 +47,16 @@ class Panels(NamedTuple):
 
 
 @kernel
+def add_rows(rows: Int64, values: Float64, sums: Float64) -> None:
+    """Add values (m, s) to their rows of `sums` (n, s), in order; none to rows below 0."""
+    for k in range(len(rows)):
+        row = rows[k]
+        if row >= 0:
+            for c in range(values.shape[1]):
+                sums[row, c] += values[k, c]
+
+
+@kernel
 def fill_in(start: Int64, rows: Int64) -> tuple[Int64, Int64]:
     """Return the pattern of the factor, (n + 1,) starts and rows, given that of the matrix.
 
