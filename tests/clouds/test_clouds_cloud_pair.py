@@ -13,7 +13,7 @@ from tofuse.engine.alignment.base import Registration
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.clouds import cloud_pair
 from tofuse.engine.clouds import pair as any_pair
-from tofuse.engine.clouds.cloud_agreement import CloudMap, cloud_agreement
+from tofuse.engine.clouds.cloud_agreement import CloudAgreement, CloudMap, cloud_agreement
 from tofuse.engine.clouds.cloud_pair import register_clouds
 from tofuse.engine.clouds.viewpoint import (
     RangeSphere,
@@ -287,6 +287,23 @@ def test_evidence_of_clouds_is_lead_in_distinct_surfaces():
     assert "frames of their cameras" not in " ".join(evidence(1.0, free_space=False).remedies)
     assert slides.remedies == ("another view, which overlaps both more",)
     assert all(evidence(lead).probability <= 0.5 for lead in (0.0, -3.0)), cases
+
+
+def test_poses_are_ranked_by_distinct_surfaces_and_matches():
+    """A wall with most of the points is one surface; what is in free space is none."""
+
+    def pose(support, surfaces, matches=0.0, violation=0.0):
+        score = support - 8 * violation
+        agreement = CloudAgreement(
+            0.7, support, violation, 0.0, 0.01, 1000, score, surfaces=surfaces, near_surfaces=50.0
+        )
+        return cloud_pair._Pose(np.eye(4), agreement, matches=matches)
+
+    walls, furniture = pose(0.6, 4.0), pose(0.3, 30.0)
+    assert walls.score > furniture.score
+    assert furniture.rank > walls.rank
+    assert pose(0.3, 30.0, violation=0.1).rank < walls.rank
+    assert pose(0.6, 4.0, matches=400.0).rank > furniture.rank
 
 
 def test_each_plane_counts_as_one_surface():
