@@ -2,13 +2,13 @@
 
 The building and the walk are those of `hours.py`. The map is the result of a run on one walk.
 Poses are right if they are so relative to the frames of the map around them, as errors of the map
-are not those of locating. Located in it are single frames of another walk through the same rooms, moved
-and turned by 10 cm and 5 degrees more ("near" the path of the map) or 40 cm and 20 degrees ("far"),
-clips of ten frames of that walk, and both in a building of the same plan with other materials and
-furniture, in which every pose is wrong. Printed: the share within 5 cm, that which is accepted,
-wrong ones among these (beyond 5 cm, or in the other building), the median error of those accepted,
-and CPU time per frame. The camera has noise only, so errors in mm are those of the map, not of a
-real camera.
+are not those of locating. Located in it are single frames of another walk through the same rooms,
+moved and turned by 10 cm and 5 degrees more ("near" the path of the map) or 40 cm and 20 degrees
+("far"), clips of ten frames of that walk, and both in a building of the same plan with other
+materials and furniture, in which every pose is wrong. Printed: the share within 5 cm, that which is
+accepted, wrong ones among these (beyond 5 cm, or in the other building), the median error of those
+accepted, and CPU time per frame. The camera has noise only, so errors in mm are those of the map,
+not of a real camera.
 
     python benchmarks/locate.py [--rooms 12] [--frames 2400] [--queries 100] [--clips 10] [--seed 1]
 """
