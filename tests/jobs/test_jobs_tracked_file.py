@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 from collections.abc import Sequence
@@ -26,9 +27,11 @@ from tofuse.engine.loops.joining import Joining
 from tofuse.engine.mapping import reconstructing as reconstruct
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.methods import from_method
+from tofuse.engine.progress import Silent
 from tofuse.engine.results.types import FrameRecord
 from tofuse.engine.search.search import SearchOptions
 from tofuse.engine.tracking.base import Step, Tracker
+from tofuse.engine.tracking.keyframe_map import Keyframe
 from written_run_json import run_json
 
 SAME = ("trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply", "mesh.glb")
@@ -84,13 +87,18 @@ def test_reconstruction_is_repeated_exactly(tmp_path: Path, monkeypatch) -> None
     monkeypatch.setattr(
         TrackedFile, "finish", lambda self, log: kept.append(log) or finish(self, log)
     )
+    trackers: list[Tracker] = []
+    start = TrackedFile.tracker
+    monkeypatch.setattr(
+        TrackedFile, "tracker", lambda self, t: trackers.append(start(self, t)) or trackers[-1]
+    )
     results = []
     for threads in (2, 1):
         file = TrackedFile(tmp_path / TRACKED, "key", lambda _text: None)
         results.append(
             reconstruct.reconstruct(recording, CONFIG, threads=threads, tracked_frames=file)
         )
-        assert isinstance(file._tracker, LoggingTracker if threads == 2 else ReplayingTracker)
+    assert [type(t) for t in trackers] == [LoggingTracker, ReplayingTracker]
     whole, again = (replace(result, threads=1) for result in results)
     assert comparable(again) == comparable(whole)
     first = [e.step for e in kept[0].entries]
@@ -98,6 +106,31 @@ def test_reconstruction_is_repeated_exactly(tmp_path: Path, monkeypatch) -> None
     assert any(e.moving_fraction > 0 for e in kept[0].entries)
     assert {step.status for step in first} >= {"tracked", "lost"}
     assert len({step.component for step in first}) > 1
+
+
+class StopsAfterTracking(Silent):
+    """Counts the tracker's keyframes in memory when loops are closed, and stops."""
+
+    keyframes = -1
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        if name == "closing loops":
+            self.keyframes = sum(isinstance(x, Keyframe) for x in gc.get_objects())
+            raise KeyboardInterrupt
+
+
+def test_keyframes_are_released_after_tracking(tmp_path: Path) -> None:
+    """They are large; without reference cycles they don't wait for the garbage collector."""
+    file = TrackedFile(tmp_path / TRACKED, "key", lambda _text: None)
+    progress = StopsAfterTracking()
+    gc.collect()
+    gc.disable()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct.reconstruct(moving_scene(), CONFIG, tracked_frames=file, progress=progress)
+    finally:
+        gc.enable()
+    assert progress.keyframes == 0
 
 
 def interrupted_at(stage: str, error: BaseException, words: Sequence[str]) -> int:

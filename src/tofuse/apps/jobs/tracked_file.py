@@ -69,7 +69,7 @@ class TrackedFile:
 
     @timing("writing")
     def finish(self, log: FrameLog) -> None:
-        """Store the steps of all frames after tracking.
+        """Store the steps of all frames after tracking, and release the tracker.
 
         Raises
         ------
@@ -77,15 +77,17 @@ class TrackedFile:
             If steps were repeated, and not those of all frames.
         """
         indices = [e.record.index for e in log.entries if e.step is not None]
-        if isinstance(self._tracker, ReplayingTracker):
-            if indices != self._tracker.indices:
+        tracker = self._tracker
+        del self._tracker  # its keyframes, which would stay in memory during all later stages
+        if isinstance(tracker, ReplayingTracker):
+            if indices != tracker.indices:
                 raise InputError(
                     "other frames can be read than before the interruption",
                     where=self._path,
                     remedy="run the same command again: it starts again from the beginning",
                 )
         elif perf_counter() - self._start_s >= _MIN_TRACKING_S:
-            self._store(_packed(log, self._tracker))
+            self._store(_packed(log, tracker))
 
     def keep_after(self, error: BaseException) -> None:
         """Keep the file if repeating the run may succeed; the error gets a note about that."""

@@ -5,6 +5,7 @@ They start from the state of the tracker between two frames.
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -190,7 +191,8 @@ class Hypotheses:
         if state.objects.in_last_view:
             T = self.T_last if self.T_predicted is None else self.T_predicted
             self.static_view = without_pixels(view, state.objects.predicted_mask(T, view))
-        self._pending = self._generate()
+        # By a weak reference: in a cycle, the views of many frames would wait for the collector.
+        self._pending = Hypotheses._generate(weakref.proxy(self))
         self._evaluated: list[Hypothesis] = []
         self._static: dict[Hypothesis, tuple[Hypothesis, ...]] = {}
 
