@@ -9,7 +9,7 @@ import pytest
 
 import tofuse
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.clouds.robust_motion import Pairs, motion_of
+from tofuse.engine.clouds.robust_motion import ConsensusOptions, Pairs, motion_of
 from tofuse.engine.clouds.robust_motion import consensus as consensus_of
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import RangeFrame
@@ -105,6 +105,16 @@ def test_inliers_are_separated_from_outliers(method, right, wrong):
         assert np.count_nonzero(found[0].inliers[right:]) <= 0.05 * wrong
         # No rival comes close.
         assert all(rival.count < 0.5 * right for rival in found[1:])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_one_inlier_in_fifty_pairs_is_enough(seed):
+    """So few that sets of compatible pairs must be small to have no outliers."""
+    pairs, T = made_pairs(10, 500, seed=seed)
+    found = consensus_of(pairs, ConsensusOptions())
+    shift, turn = off(found[0].T_target_source, T)
+    assert shift < 0.06
+    assert turn < 2
 
 
 @pytest.mark.parametrize("method", METHODS)
