@@ -62,21 +62,23 @@ class KdTree:
         array = checked_points(queries, "queries")
         index = np.full((len(array), k), -1, np.int64)
         distance2 = np.full((len(array), k), np.inf)
+        if not len(self):
+            return index, distance2
         # SciPy's limit is exclusive: points at the limit are found, and those beyond it dropped.
         bound = max_distance * (1 + 1e-9) + 1e-100
         ranks = range(1, k + 1)
 
         def work(a: int, b: int) -> None:
-            finite = a + np.flatnonzero(np.isfinite(array[a:b]).all(1))
-            _, found = self._tree.query(array[finite], ranks, distance_upper_bound=bound)
-            row, rank = np.nonzero(found < len(self))
-            found = found[row, rank]
-            difference = array[finite[row]] - self._points[found]
-            x, y, z = difference.T
-            squared = x * x + y * y + z * z
-            near = squared <= max_distance * max_distance
-            index[finite[row[near]], rank[near]] = found[near]
-            distance2[finite[row[near]], rank[near]] = squared[near]
+            rows = a + np.flatnonzero(np.isfinite(array[a:b]).all(1))
+            finite = array[rows]
+            _, found = self._tree.query(finite, ranks, distance_upper_bound=bound)
+            nearest, squared = np.minimum(found, len(self) - 1), np.zeros(found.shape)
+            for points, queries in zip(self._points.T, finite.T, strict=True):
+                difference = queries[:, None] - points[nearest]
+                squared += difference * difference
+            absent = (found == len(self)) | (squared > max_distance * max_distance)
+            found[absent], squared[absent] = -1, np.inf
+            index[rows], distance2[rows] = found, squared
 
         size = len(array)
         chunks = min(16, 2 * size // _MIN_PARALLEL) if size > _MIN_PARALLEL else 1
