@@ -30,8 +30,8 @@ _INLIER_GATES = (2.0, 1.5, 1.0, 1.0, 1.0)
 _MAX_REFINED = 120
 # Motions whose residuals are computed at once.
 _BATCH = 256
-# Size of the consensus set of a seed (SC2-PCR: its nearest neighbours in compatibility). Where views
-# overlap little, right matches are so few that larger sets would contain outliers.
+# Size of the consensus set of a seed (SC2-PCR: its nearest neighbours in compatibility). Where
+# views overlap little, right matches are so few that larger sets would contain outliers.
 _CONSENSUS_SIZE = 8
 # Maximum number of pairs in the compatibility matrix, whose memory is quadratic.
 _MAX_COMPATIBLE_PAIRS = 2000
