@@ -9,7 +9,9 @@ from tofuse.engine.stored_views import pair_equation_kernels as kernels
 KNOWN = np.ones(kernels.ERRORS, np.int64)
 
 
-def pair_equations(points, surface, T, residuals, errors=None, known=KNOWN, patches=None, count=0):
+def pair_equations(
+    points, surface, T, residuals, errors=None, known=KNOWN, patches=None, count=0, scale=1.0
+):
     """Equations (SIZE,) of source points and a target surface, and their sums over patches."""
     row, sums = np.empty((1, kernels.SIZE)), np.empty((1, count, kernels.PATCH_SIZE))
     scales = (np.array([scale]) for scale in residuals[:3])
@@ -28,6 +30,7 @@ def pair_equations(points, surface, T, residuals, errors=None, known=KNOWN, patc
         np.zeros(kernels.ERRORS) if errors is None else errors,
         known,
         surface.measures_range,
+        scale,
         row,
         sums,
     )

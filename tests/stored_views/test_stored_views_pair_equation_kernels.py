@@ -12,7 +12,9 @@ from pair_equations import KNOWN, pair_equations
 from tofuse.engine.alignment.projective import points_of
 from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.geometry import se3
+from tofuse.engine.stored_views import SampledView
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
+from tofuse.engine.views import residual_kernels
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
 
@@ -201,6 +203,7 @@ def test_pairs_of_target_have_equations_of_single_pairs(pair, known):
         errors,
         known,
         views[1].measures_range,
+        1.0,
         found,
         np.empty((2, 0, kernels.PATCH_SIZE)),
     )
@@ -208,3 +211,16 @@ def test_pairs_of_target_have_equations_of_single_pairs(pair, known):
         settings = (*(scale[k] for scale in scales), *SETTINGS[3:])
         alone = evaluate(of, target, poses[k], errors, known, settings)
         np.testing.assert_array_equal(found[k], alone)
+
+
+def test_scale_of_target_is_that_of_its_depth(pair):
+    source, target, T = pair
+    points = points_of(prepare_view(source, SHARP), 1)
+    view = SampledView.of(prepare_view(target, SHARP), 100)
+    image = view.target.copy()
+    image[..., residual_kernels.DISTANCE] *= 1.02
+    image[..., residual_kernels.VARIANCE] *= 1.02**2
+    found, _ = pair_equations(points, view, T, SETTINGS, scale=1.02)
+    expected, _ = pair_equations(points, replace(view, target=image), T, SETTINGS)
+    np.testing.assert_array_equal(found, expected)
+    assert np.any(found != pair_equations(points, view, T, SETTINGS)[0])

@@ -75,12 +75,15 @@ class CameraErrors(NamedTuple):
         (ERRORS,) non-zero for errors that are not estimated.
     radial_source, radial_target
         Whether the cameras measure radial range, not z.
+    target_scale
+        By which the depth in the target image is multiplied.
     """
 
     errors: Float64
     known: Int64
     radial_source: bool
     radial_target: bool
+    target_scale: float
 
 
 class SourcePoints(NamedTuple):
@@ -135,6 +138,7 @@ def target_equations(
     errors: Float64,
     known: Int64,
     radial_target: bool,
+    target_scale: float,
     out: Float64,
     sums: Float64,
 ) -> None:
@@ -150,7 +154,7 @@ def target_equations(
         (K, 4, 4) T_target_source.
     residuals
         Of these pairs.
-    errors, known, radial_target
+    errors, known, radial_target, target_scale
         As in `CameraErrors`.
     out
         (K, SIZE), is overwritten.
@@ -168,7 +172,8 @@ def target_equations(
         pair = residual.Residuals(
             exposure[k], scale_g[k], scale_p[k], inflation, robust, min_cosine
         )
-        camera = CameraErrors(errors, known, sources.measures_range[view], radial_target)
+        radial_source = sources.measures_range[view]
+        camera = CameraErrors(errors, known, radial_source, radial_target, target_scale)
         patches = sources.patches[begin:end]
         _pair_equations(points, patches, target, T[k], pair, camera, out[k], sums[k])
 
@@ -185,7 +190,7 @@ def _pair_equations(
     sums: Float64,
 ) -> None:
     """Add those of one pair, vectorised in blocks as in `alignment`."""
-    errors, known, radial_source, radial_target = camera
+    errors, known, radial_source, radial_target, target_scale = camera
     has_errors = (errors != 0).any()
     estimated = np.flatnonzero(known == 0)
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
@@ -209,6 +214,8 @@ def _pair_equations(
         if has_errors:
             _distort_projection(block, errors, radial_target)
         residual.project_block(block, count, image, lookup, lookup_frame)
+        if target_scale != 1:
+            _scale_planes(block, target_scale)
         residual.compare_planes(block, T, scale_g, inflation, robust, min_cosine)
         for k in range(count):
             if block[residual.HAS_PLANE * residual.LANES + k] > 0:
@@ -396,6 +403,16 @@ def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
             shortening = ((ray_scale - 1) * lateral2 + center_term) / (lateral2 + 1)
         z[k] -= errors[OFFSET] / range_per_z
         z[k] /= 1 + errors[SCALE] - shortening
+
+
+@kernel
+def _scale_planes(block: Float32, scale: float) -> None:
+    """Multiply the depth of the target's planes that a block's points are compared with."""
+    distance, variance = residual.PIXEL + residual.DISTANCE, residual.PIXEL + residual.VARIANCE
+    scale32, squared = np.float32(scale), np.float32(scale * scale)
+    for k in range(residual.LANES):
+        block[distance * residual.LANES + k] *= scale32
+        block[variance * residual.LANES + k] *= squared
 
 
 @kernel

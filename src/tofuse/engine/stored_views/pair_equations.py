@@ -242,6 +242,7 @@ def evaluate(
                 errors,
                 fixed_errors,
                 target.measures_range,
+                target.target_scale,
                 pair_rows,
                 patch_sums,
             )

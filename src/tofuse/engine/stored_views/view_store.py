@@ -60,8 +60,10 @@ class CoarseView:
 
     def scaled(self, factor: float) -> CoarseView:
         """Return the view with its depth scaled."""
-        points, target = _scaled_points(self.points, factor), _scaled_target(self.target, factor)
-        return replace(self, points=points, target=target)
+        k, target = residual_kernels, self.target.copy()
+        target[..., k.DISTANCE] *= factor
+        target[..., k.VARIANCE] *= factor**2
+        return replace(self, points=_scaled_points(self.points, factor), target=target)
 
     @property
     def centroid(self) -> Float64:
@@ -105,7 +107,7 @@ class SampledView:
     has_albedo, measures_range
         As of `PreparedView`.
     target_scale
-        By which the depth of the target image is multiplied when it is used: the images of all
+        By which the depth in the target image is multiplied where it is used: the images of all
         views are not in memory twice.
     """
 
@@ -152,11 +154,9 @@ class SampledView:
 
     @property
     def target_image(self) -> residual_kernels.TargetImage:
-        """The target image and its projection."""
-        target = self.target
-        if self.target_scale != 1:
-            target = _scaled_target(target, self.target_scale)
-        return residual_kernels.TargetImage(target, self.projection.lookup, self.projection.frame)
+        """The target image, without `target_scale`, and its projection."""
+        p = self.projection
+        return residual_kernels.TargetImage(self.target, p.lookup, p.frame)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -190,14 +190,6 @@ def _scaled_points(points: Float32, factor: float) -> Float32:
     points[:, k.POINT : k.POINT + 3] *= factor
     points[:, k.POINT_ALBEDO_SLOPE : k.POINT_ALBEDO_SLOPE + 3] /= factor
     return points
-
-
-def _scaled_target(target: Float32, factor: float) -> Float32:
-    """Return a target image (H, W, PIXEL_SIZE) with its depth scaled."""
-    k, target = residual_kernels, target.copy()
-    target[..., k.DISTANCE] *= factor
-    target[..., k.VARIANCE] *= factor**2
-    return target
 
 
 def sampled_points(surface: PreparedView, count: int) -> Float32:
