@@ -5,9 +5,9 @@ or 5 % of the extent if that is less, at the centre of the source, and 4 degrees
 3DMatch as its papers define it: an approximate rms error within 0.2 m), how many of those are
 accepted, and how many are accepted and wrong; also for the peers that are installed, with voxels of
 1/100 of the target's extent: Open3D's RANSAC over FPFH with point-to-plane ICP, KISS-Matcher, also
-with small_gicp and FRICP, and small_gicp from the identity. In brackets is the mean over scenes, or
-angles of the dragon, whose counts follow.
-Results are kept in a journal, if one is given, to continue from.
+with small_gicp and FRICP, small_gicp from the identity, and splatreg's classical seed. In brackets
+is the mean over scenes, or angles of the dragon, whose counts follow. Results are kept in a
+journal, if one is given, to continue from.
 
 `fit` fits the logistic models of `tofuse.engine.search.pose_probability`, and prints how families
 fare that are left out of the fit (`cloud_belief.py`). `viewpoints` counts the clouds whose origin
@@ -38,7 +38,7 @@ import cloud_kinds
 import tofuse
 from attacks.journal import Lines
 from cloud_kinds import KINDS, Pair
-from peers import kiss_global, o3d_global
+from peers import kiss_global, o3d_global, splat_global
 from sequences import DATA
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.clouds.viewpoint import viewpoint_of
@@ -53,6 +53,7 @@ PEERS: dict[str, Callable[[float], Method | None]] = {
     "KISS-Matcher, GICP": kiss_global.with_gicp,
     "KISS-Matcher, FRICP": kiss_global.with_fricp,
     "GICP": kiss_global.gicp,
+    "splatreg": splat_global.method,
 }
 _OURS = "tofuse"
 
