@@ -24,14 +24,23 @@ def pair_equations(
             np.array([surface.measures_range]),
         ),
         np.array([0]),
-        surface.target_image,
+        *targets([surface], [0, 1], scale),
         np.ascontiguousarray(T)[None],
         kernels.PairResiduals(*scales, *residuals[3:]),
         np.zeros(kernels.ERRORS) if errors is None else errors,
         known,
-        surface.measures_range,
-        scale,
         row,
         sums,
     )
     return row[0], sums[0]
+
+
+def targets(surfaces, ends, scale=1.0):
+    """Images and targets of the kernel: the pairs of surface k are from ends[k] to ends[k + 1]."""
+    images = [surface.target_image for surface in surfaces]
+    images += images[-1:] * (kernels.TARGETS - len(images))
+    return tuple(images), kernels.TargetViews(
+        np.array([surface.measures_range for surface in surfaces]),
+        np.full(len(surfaces), scale),
+        np.array(ends),
+    )

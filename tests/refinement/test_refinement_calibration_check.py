@@ -16,7 +16,7 @@ from tofuse.engine.refinement.calibration_check import (
     CalibrationCheck,
     check_calibration,
 )
-from tofuse.engine.refinement.camera_response import response, significance_of
+from tofuse.engine.refinement.camera_response import Linearised, Response, significance_of
 from tofuse.engine.refinement.joint_alignment import (
     Priors,
     Refined,
@@ -36,6 +36,12 @@ def kept(offset: float, views: int = 12) -> tuple[list[SampledView], Refined]:
     truth = path(12)[:views]
     views = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.003, offset=offset)]
     return views, refine(views, truth, OPTIONS)
+
+
+def response(views: list[SampledView], refined: Refined) -> Response:
+    """Response of refined views to the errors that they share."""
+    linearised = Linearised.of(views, refined.poses, refined.pairs, OPTIONS, Priors.none())
+    return linearised.response_to_errors()
 
 
 @pytest.mark.nightly_part
@@ -93,9 +99,9 @@ def test_focal_length_without_rotation_is_undetermined():
     turned = [SampledView.of(s, 1500) for s in surfaces(path(12), noise=0.01)]
 
     def sigma(views: list[SampledView], poses: np.ndarray) -> float:
-        pairs = refine(views, poses, OPTIONS).pairs
-        responses = response(views, poses, pairs, OPTIONS)
-        return float(responses.sigma(pairs, len(views))[kernels.FOCAL])
+        refined = refine(views, poses, OPTIONS)
+        responses = response(views, replace(refined, poses=poses))
+        return float(responses.sigma(refined.pairs, len(views))[kernels.FOCAL])
 
     assert sigma(views, truth) > 0.1
     assert sigma(turned, path(12)) < 0.02
@@ -106,9 +112,7 @@ def test_single_step_estimates_whole_error() -> None:
 
     def step(offset: float) -> float:
         views, refined = kept(offset)
-        return float(
-            response(views, refined.poses, refined.pairs, OPTIONS).estimate()[kernels.OFFSET]
-        )
+        return float(response(views, refined).estimate()[kernels.OFFSET])
 
     assert step(0.02) - step(0.005) == pytest.approx(0.015, rel=0.2)
 

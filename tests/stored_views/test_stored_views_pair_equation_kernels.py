@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from corner_views import SHARP, corner, unpack
-from pair_equations import KNOWN, pair_equations
+from pair_equations import KNOWN, pair_equations, targets
 from tofuse.engine.alignment.projective import points_of
 from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.geometry import se3
@@ -197,13 +197,11 @@ def test_pairs_of_target_have_equations_of_single_pairs(pair, known):
             np.zeros(2, bool),
         ),
         np.array([1, 0]),
-        views[1].target_image,
+        *targets(views[1:], [0, 2]),
         poses,
         kernels.PairResiduals(*scales, *SETTINGS[3:]),
         errors,
         known,
-        views[1].measures_range,
-        1.0,
         found,
         np.empty((2, 0, kernels.PATCH_SIZE)),
     )

@@ -374,3 +374,10 @@ def scale_of_distances(histogram: Float64) -> float:
             return 1.48 * np.sqrt(low + (high - low) * (0.5 * count - cumulative) / in_bin)
         cumulative += in_bin
     return np.nan
+
+
+@kernel
+def scales_of_distances(histograms: Float64, out: Float64) -> None:
+    """Write the `scale_of_distances` of histograms (N, BINS) to `out` (N,)."""
+    for k in range(len(histograms)):
+        out[k] = scale_of_distances(histograms[k])

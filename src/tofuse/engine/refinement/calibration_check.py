@@ -356,7 +356,7 @@ class _Estimator:
         # compared with the refined poses.
         self._views, self._first = views, first
         self._options = replace(thinned_options, rounds=COARSE_TO_FINE[-1:])
-        self._align = partial(align_views, views, priors=priors, pairs=pairs)
+        self._align = partial(align_views, views, priors=priors, pairs=pairs, scales=refined.scales)
         self._witness = priors.witness
         self._poses = self._align(refined.poses, replace(self._options, rounds=_REALIGNMENT)).poses
 
@@ -451,18 +451,21 @@ def _check_by_loop(
     uncorrected = loop.aligned(loop.steps(refined.start), np.zeros(kernels.ERRORS))
     if not loop.gap(uncorrected, uncorrected).significant:
         return without_error
-    candidates: dict[str, tuple[float, Gap]] = {}
-    sigmas = first.sigmas
-    for name in (name for name in _REVEALED_BY_LOOP if name in first.determined):
+
+    def revealed(name: str) -> tuple[float, Gap] | None:
         step = _LOOP_FACTOR * TOLERANCES[name]
         error, corrected = loop.closing_error(uncorrected, _INDEX[name], step)
         gap = loop.gap(uncorrected, corrected)
-        limit = without_error.significance * sigmas[name]
+        limit = without_error.significance * first.sigmas[name]
         if not (gap.closes and _large(name, error, limit, _LOOP_FACTOR)):
-            continue
+            return None
         confirmed = loop.error_by_views(corrected, _INDEX[name], error)
-        if _large(name, confirmed, limit, _LOOP_FACTOR) and confirmed / error > _MIN_CONFIRMED:
-            candidates[name] = error, gap
+        is_confirmed = _large(name, confirmed, limit, _LOOP_FACTOR)
+        return (error, gap) if is_confirmed and confirmed / error > _MIN_CONFIRMED else None
+
+    names = [name for name in _REVEALED_BY_LOOP if name in first.determined]
+    found = run_all([partial(revealed, name) for name in names])
+    candidates = {name: of for name, of in zip(names, found, strict=True) if of is not None}
     if not candidates:
         return without_error
     best = min(candidates, key=lambda name: candidates[name][1].remaining_m)
@@ -470,7 +473,7 @@ def _check_by_loop(
         without_error,
         alarm=True,
         errors={name: error for name, (error, _) in candidates.items()},
-        sigmas={name: sigmas[name] for name in candidates},
+        sigmas={name: first.sigmas[name] for name in candidates},
         gap=candidates[best][1],
         best=best,
     )

@@ -112,10 +112,19 @@ class Linearised:
         poses: Float64,
         pairs: Intp,
         options: pair_equations.RefineOptions,
-        priors: Priors | None = None,
+        priors: Priors,
     ) -> Linearised:
-        """Linearise views at refined poses. The parameters are those of `response`."""
-        priors = priors or Priors.none()
+        """Linearise views at refined poses.
+
+        Parameters
+        ----------
+        views, options, priors
+            As for `refine`.
+        poses
+            (N, 4, 4) T_world_camera, refined without any error.
+        pairs
+            (M, 2) positions of views i < j.
+        """
         zero_errors, estimate_all = np.zeros(kernels.ERRORS), np.zeros(kernels.ERRORS, np.int64)
         stage = options.rounds[-1]
         state = pair_equations.directed_pairs(views, pairs, options)
@@ -227,26 +236,3 @@ def significance_of(view_count: float, tests: int = 1) -> float:
     Of several tests, one of which is picked, each must be less likely (Bonferroni).
     """
     return -float(stdtrit(max(view_count - 1, 1), ndtr(-SIGNIFICANT) / tests))
-
-
-def response(
-    views: Sequence[SampledView],
-    poses: Float64,
-    pairs: Intp,
-    options: pair_equations.RefineOptions,
-    priors: Priors | None = None,
-) -> Response:
-    """Compute the sensitivity of refined views to errors of the camera that they share.
-
-    Parameters
-    ----------
-    views, options
-        As for `refine`.
-    poses
-        (N, 4, 4) T_world_camera, refined without any error.
-    pairs
-        (M, 2) positions of views i < j.
-    priors
-        Measurements by other sensors.
-    """
-    return Linearised.of(views, poses, pairs, options, priors).response_to_errors()

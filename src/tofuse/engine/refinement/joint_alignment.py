@@ -132,8 +132,7 @@ class Refined:
         (M, 4, 4) T_i_j that minimises the residuals of each pair alone, and (M, 6, 6) information
         of its right perturbation, from the noise of the views and the errors that patches share.
     scales
-        (2M, 3) exposure, and factors of the sigmas of distance and albedo, of the pairs (i, j),
-        then of the pairs (j, i).
+        Exposures and scales of the pairs in both directions.
     """
 
     poses: Float64
@@ -145,7 +144,7 @@ class Refined:
     after: Support
     measured: Float64
     information: Float64
-    scales: Float64
+    scales: pair_equations.KnownScales
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,8 +227,8 @@ def refine(
     before = _support(
         views, start, np.zeros_like(errors), fixed_errors, state, final_round, options
     )
-    scales = np.stack([state.exposure, state.scale_g, state.scale_p], 1)
-    return Refined(poses, start, errors, pairs, aligned.moved, before, after, *measured, scales)
+    moved, scales = aligned.moved, state.known_scales
+    return Refined(poses, start, errors, pairs, moved, before, after, *measured, scales)
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,11 +270,12 @@ def align_views(
     priors: Priors | None = None,
     pairs: Intp | None = None,
     bodies: Bodies | None = None,
+    scales: pair_equations.KnownScales | None = None,
 ) -> AlignedViews:
     """Do as `refine` does, without measuring the support and the pairs of the result.
 
     Gauss-Newton on all residuals, with correspondences recomputed in each iteration. The parameters
-    are those of `refine`.
+    are those of `refine`, and scales of pairs to begin with.
     """
     priors = priors or Priors.none()
     errors = np.zeros(kernels.ERRORS) if errors is None else errors
@@ -284,14 +284,14 @@ def align_views(
     motions: list[float] = []
     error_changes = [np.inf]
     overlapping = _overlapping(views, poses, options, bodies) if pairs is None else pairs
-    state = pair_equations.directed_pairs(views, overlapping, options)
+    state = pair_equations.directed_pairs(views, overlapping, options, scales)
     system = _system(state, len(views), priors, bodies)
     motion_since_overlaps = 0.0
     earlier_error_step = np.zeros(kernels.ERRORS)
     for stage in options.rounds:
         if motion_since_overlaps >= _MAX_MOTION:
             overlapping = _overlapping(views, poses, options, bodies)
-            state = pair_equations.directed_pairs(views, overlapping, options, state)
+            state = pair_equations.directed_pairs(views, overlapping, options, state.known_scales)
             system = _system(state, len(views), priors, bodies)
             motion_since_overlaps = 0.0
         for _ in range(stage.iterations if len(state.target) else 0):
@@ -336,8 +336,7 @@ def support_of(
     options: pair_equations.RefineOptions,
 ) -> Support:
     """Support of the same pairs at other poses (N, 4, 4), with the same sigmas."""
-    state = pair_equations.directed_pairs(views, refined.pairs, options)
-    state.exposure, state.scale_g, state.scale_p = refined.scales.T.copy()
+    state = pair_equations.directed_pairs(views, refined.pairs, options, refined.scales)
     fixed_errors = (refined.errors == 0).astype(np.int64)
     return _support(views, poses, refined.errors, fixed_errors, state, options.rounds[-1], options)
 
@@ -368,13 +367,14 @@ def align_pairs(
     T_i_j: Float64,
     options: pair_equations.RefineOptions,
     errors: Float64,
+    scales: pair_equations.KnownScales,
 ) -> Float64:
     """(M, 4, 4) relative poses T_i_j of pairs, each aligned separately.
 
     Parameters
     ----------
-    views, options
-        As for `refine`.
+    views, options, scales
+        As for `align_views`.
     pairs
         (M, 2) positions of views.
     T_i_j
@@ -387,7 +387,10 @@ def align_pairs(
     ends = np.arange(2 * count).reshape(-1, 2)
     poses = np.tile(np.eye(4), (2 * count, 1, 1))
     poses[1::2] = T_i_j
-    state = pair_equations.directed_pairs(views, ends, options)
+    i, j = pairs.T
+    known = scales.of(np.concatenate([i, j]), np.concatenate([j, i]))
+    doubled = pair_equations.KnownScales(ends.T.ravel(), ends[:, ::-1].T.ravel(), known)
+    state = pair_equations.directed_pairs(views, ends, options, doubled)
     fixed_errors, stage = np.ones(len(errors), np.int64), options.rounds[-1]
     active = np.arange(count)
     for _ in range(_PAIR_ITERATIONS):

@@ -144,7 +144,7 @@ def loop_gap(
 class Loop:
     """A chain of overlapping consecutive views i to j, of which the ends overlap too.
 
-    `pairs` (M, 2) are all that were refined.
+    `pairs` (M, 2) are all that were refined, and `scales` theirs.
     """
 
     views: Sequence[SampledView]
@@ -152,6 +152,7 @@ class Loop:
     i: int
     j: int
     options: pair_equations.RefineOptions
+    scales: pair_equations.KnownScales
 
     @classmethod
     def longest(
@@ -159,7 +160,9 @@ class Loop:
     ) -> Loop | None:
         """Return the longest loop of refined views; None if there is none."""
         ends = longest_loop(refined.pairs)
-        return None if ends is None else cls(views, refined.pairs, *ends, options)
+        if ends is None:
+            return None
+        return cls(views, refined.pairs, *ends, options, refined.scales)
 
     @property
     def depth(self) -> float:
@@ -173,7 +176,7 @@ class Loop:
 
     def aligned(self, steps: Float64, errors: Float64) -> Float64:
         """Return the `steps`, each aligned separately with assumed (ERRORS,) of the camera."""
-        return align_pairs(self.views, self._pairs, steps, self.options, errors)
+        return align_pairs(self.views, self._pairs, steps, self.options, errors, self.scales)
 
     @property
     def _pairs(self) -> Intp:

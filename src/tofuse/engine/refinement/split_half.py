@@ -27,7 +27,7 @@ from tofuse.engine.refinement.joint_alignment import Priors, Refined, align_view
 from tofuse.engine.stored_views import SampledView, pair_equations, shared_error
 
 # The poses are near the solution of each half.
-_ROUNDS = (pair_equations.Round(5, 0.0, 0.0),)
+_ROUNDS = (pair_equations.Round(4, 0.0, 0.0),)
 # Every n-th point of a half is enough for the errors that they share.
 _POINT_STRIDE = 2
 
@@ -84,6 +84,7 @@ def refined_by_halves(
             errors=refined.errors,
             priors=priors,
             pairs=refined.pairs,
+            scales=refined.scales,
         ).poses
 
     left = [v.patches % shared_error.ACROSS < shared_error.ACROSS // 2 for v in views]

@@ -171,8 +171,9 @@ def refine_submaps(
         no_support = Support(empty.astype(np.intp), empty.astype(np.intp), empty, empty)
         measured = np.zeros((0, 4, 4)), np.zeros((0, 6, 6))
         errors = np.zeros(kernels.ERRORS)
+        no_scales = _combined_scales([])
         unmoved = Refined(
-            poses, poses, errors, pairs, (), no_support, no_support, *measured, np.zeros((0, 3))
+            poses, poses, errors, pairs, (), no_support, no_support, *measured, no_scales
         )
         return unmoved, []
     errors = np.median([r.errors for _, r in refined_submaps], axis=0)
@@ -194,7 +195,7 @@ def refine_submaps(
         _combined_support([(part, s) for (part, _), s in zip(refined_submaps, after, strict=True)]),
         T_i_j,
         information,
-        np.concatenate([r.scales for _, r in refined_submaps]),
+        _combined_scales([(part, r.scales) for part, r in refined_submaps]),
     )
     return combined, [evaluation for _, evaluation in results]
 
@@ -259,4 +260,16 @@ def _combined_support(supports: Sequence[tuple[Submap, Support]]) -> Support:
         np.concatenate([part.views[s.source] for part, s in supports]),
         np.concatenate([s.score for _, s in supports]),
         np.concatenate([s.terms for _, s in supports]),
+    )
+
+
+def _combined_scales(
+    scales: Sequence[tuple[Submap, pair_equations.KnownScales]],
+) -> pair_equations.KnownScales:
+    """The scales of all submaps, by positions among all views."""
+    none = np.zeros(0, np.intp)
+    return pair_equations.KnownScales(
+        np.concatenate([none, *(part.views[s.target] for part, s in scales)]),
+        np.concatenate([none, *(part.views[s.source] for part, s in scales)]),
+        np.concatenate([np.zeros((0, 3)), *(s.scales for _, s in scales)]),
     )

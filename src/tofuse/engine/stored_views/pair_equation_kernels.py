@@ -56,12 +56,20 @@ _EPSILON = 1e-6  # m or m^2, instead of 0 in a denominator
 _RESPONSE = residual.ROWS
 _MEASURED = _RESPONSE + ERRORS
 _ROWS = _MEASURED + 3
+# Rows of the sums over columns: products of the rows of J and r; counts and sums, as from INLIERS
+# to COUNT_P of `alignment`, with the support in place of one that is not needed.
+_COUNTS = 36
+_SUPPORT = _COUNTS + residual.SQUARES_G - residual.INLIERS
+_TOTALS = _COUNTS + residual.COUNT_P + 1 - residual.INLIERS
 
 # Layout of the sums of a patch: of w, w r and w J.
 PATCH_WEIGHT = 0
 PATCH_RESIDUAL = 1
 PATCH_RESPONSE = 2
 PATCH_SIZE = 8
+
+# Largest number of targets of one call.
+TARGETS = 8
 
 
 class CameraErrors(NamedTuple):
@@ -71,8 +79,8 @@ class CameraErrors(NamedTuple):
     ----------
     errors
         (ERRORS,) assumed errors, by which points and planes are displaced.
-    known
-        (ERRORS,) non-zero for errors that are not estimated.
+    estimated
+        (E,) numbers of the errors that are estimated.
     radial_source, radial_target
         Whether the cameras measure radial range, not z.
     target_scale
@@ -80,10 +88,29 @@ class CameraErrors(NamedTuple):
     """
 
     errors: Float64
-    known: Int64
+    estimated: Int64
     radial_source: bool
     radial_target: bool
     target_scale: float
+
+
+class Scratch(NamedTuple):
+    """Memory that all pairs use.
+
+    Attributes
+    ----------
+    block
+        (_ROWS * LANES,) of `residual_kernels`, and the responses to errors of the camera.
+    total
+        (_TOTALS, LANES) sums of each column.
+    error_total
+        (E, 8 + ERRORS, LANES) sums of products with each estimated error: of J and r, and of the
+        errors from this one on.
+    """
+
+    block: Float32
+    total: Float32
+    error_total: Float32
 
 
 class SourcePoints(NamedTuple):
@@ -128,34 +155,52 @@ class PairResiduals(NamedTuple):
     min_cosine: float
 
 
+class TargetViews(NamedTuple):
+    """Up to `TARGETS` views that others are compared with, without their images.
+
+    Attributes
+    ----------
+    measures_range
+        (N,) as of `SourcePoints`.
+    scale
+        (N,) factors of the depth in the images.
+    ends
+        (N + 1,) the pairs of target k are from ends[k] to ends[k + 1].
+    """
+
+    measures_range: Bool
+    scale: Float64
+    ends: Int64
+
+
 @kernel
 def target_equations(
     sources: SourcePoints,
     views: Int64,
-    target: residual.TargetImage,
+    images: tuple[residual.TargetImage, ...],
+    targets: TargetViews,
     T: Float64,
     residuals: PairResiduals,
     errors: Float64,
     known: Int64,
-    radial_target: bool,
-    target_scale: float,
     out: Float64,
     sums: Float64,
 ) -> None:
-    """Sum the normal equations of the K pairs of one target.
+    """Sum the normal equations of the K pairs of some targets.
 
     Parameters
     ----------
     sources, views
-        Points of all views, and the (K,) indices of those that are compared with the target.
-    target
-        The target.
+        Points of all views, and the (K,) indices of those that are compared with the targets.
+    images, targets
+        The N targets: several, as a call costs as much as a pair. `TARGETS` images, of which those
+        beyond N are not used.
     T
         (K, 4, 4) T_target_source.
     residuals
         Of these pairs.
-    errors, known, radial_target, target_scale
-        As in `CameraErrors`.
+    errors, known
+        (ERRORS,) assumed errors of the camera, and non-zero for those that are not estimated.
     out
         (K, SIZE), is overwritten.
     sums
@@ -165,17 +210,37 @@ def target_equations(
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     out[:] = 0.0
     sums[:] = 0.0
-    for k in range(len(views)):
-        view = views[k]
-        begin, end = sources.begin[view], sources.end[view]
-        points = sources.points[begin:end]
-        pair = residual.Residuals(
-            exposure[k], scale_g[k], scale_p[k], inflation, robust, min_cosine
-        )
-        radial_source = sources.measures_range[view]
-        camera = CameraErrors(errors, known, radial_source, radial_target, target_scale)
-        patches = sources.patches[begin:end]
-        _pair_equations(points, patches, target, T[k], pair, camera, out[k], sums[k])
+    estimated = np.flatnonzero(known == 0)
+    scratch = Scratch(
+        np.zeros(_ROWS * residual.LANES, np.float32),
+        np.empty((_TOTALS, residual.LANES), np.float32),
+        np.empty((len(estimated), 8 + ERRORS, residual.LANES), np.float32),
+    )
+    for t in range(len(targets.scale)):
+        for k in range(targets.ends[t], targets.ends[t + 1]):
+            view = views[k]
+            begin, end = sources.begin[view], sources.end[view]
+            pair = residual.Residuals(
+                exposure[k], scale_g[k], scale_p[k], inflation, robust, min_cosine
+            )
+            camera = CameraErrors(
+                errors,
+                estimated,
+                sources.measures_range[view],
+                targets.measures_range[t],
+                targets.scale[t],
+            )
+            _pair_equations(
+                sources.points[begin:end],
+                sources.patches[begin:end],
+                images[t],
+                T[k],
+                pair,
+                camera,
+                scratch,
+                out[k],
+                sums[k],
+            )
 
 
 @kernel
@@ -186,21 +251,19 @@ def _pair_equations(
     T: Float64,
     residuals: residual.Residuals,
     camera: CameraErrors,
+    scratch: Scratch,
     out: Float64,
     sums: Float64,
 ) -> None:
     """Add those of one pair, vectorised in blocks as in `alignment`."""
-    errors, known, radial_source, radial_target, target_scale = camera
+    errors, estimated, radial_source, radial_target, target_scale = camera
     has_errors = (errors != 0).any()
-    estimated = np.flatnonzero(known == 0)
+    errors32 = errors.astype(np.float32)
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
     image, lookup, lookup_frame = target
-    block = np.zeros(_ROWS * residual.LANES, np.float32)
-    # Products of the rows of J and r, followed by counts and sums over columns.
-    products, support = 36, 36 + residual.SQUARES_G - residual.INLIERS
-    total = np.zeros((36 + residual.COUNT_P + 1 - residual.INLIERS, residual.LANES), np.float32)
-    # Products with each estimated error: of J and r, and of the errors from this one on.
-    error_total = np.zeros((len(estimated), 8 + ERRORS, residual.LANES), np.float32)
+    block, total, error_total = scratch
+    total[:] = 0
+    error_total[:] = 0
     for first in range(0, len(points), residual.LANES):
         count = min(residual.LANES, len(points) - first)
         residual.load_block(block, points[first : first + count])
@@ -209,10 +272,10 @@ def _pair_equations(
                 residual.POINT * residual.LANES : (residual.POINT + 3) * residual.LANES
             ]
         if has_errors:
-            _correct_points(block, errors, radial_source)
+            _correct_points(block, errors32, radial_source)
         residual.transform_block(block, T)
         if has_errors:
-            _distort_projection(block, errors, radial_target)
+            _distort_projection(block, errors32, radial_target)
         residual.project_block(block, count, image, lookup, lookup_frame)
         if target_scale != 1:
             _scale_planes(block, target_scale)
@@ -229,14 +292,14 @@ def _pair_equations(
         if len(estimated) > 0:
             _respond_to_errors(block, T, radial_source, radial_target, True)
             _add_error_products(error_total, block, estimated)
-        _add_support(total[support], block, residual.WEIGHT_G)
+        _add_support(total[_SUPPORT], block, residual.WEIGHT_G)
         if scale_p > 0:
             residual.compare_albedos(block, T, exposure, scale_p, robust)
             residual.add_products(total, block, 8)
             if len(estimated) > 0:
                 _respond_to_errors(block, T, radial_source, radial_target, False)
                 _add_error_products(error_total, block, estimated)
-            _add_support(total[support], block, residual.WEIGHT_P)
+            _add_support(total[_SUPPORT], block, residual.WEIGHT_P)
         for statistic in (
             residual.IN_FRONT,
             residual.WEIGHT_P,
@@ -244,7 +307,7 @@ def _pair_equations(
             residual.COUNT_P,
         ):
             index = statistic - residual.INLIERS
-            column = total[products + index]
+            column = total[_COUNTS + index]
             row = block[
                 (residual.STAT + index) * residual.LANES : (residual.STAT + index + 1)
                 * residual.LANES
@@ -268,11 +331,11 @@ def _pair_equations(
         out[GRADIENT + unknown] = error_total[k, 7, 0]
         for o in range(k, len(estimated)):
             out[_product(unknown, 7 + estimated[o])] = error_total[k, 8 + o, 0]
-    out[IN_FRONT] = total[products + residual.IN_FRONT - residual.INLIERS, 0]
-    out[WEIGHT_P] = total[products + residual.WEIGHT_P - residual.INLIERS, 0]
-    out[SQUARES_P] = total[products + residual.SQUARES_P - residual.INLIERS, 0]
-    out[TERMS] = out[COMPARED] + total[products + residual.COUNT_P - residual.INLIERS, 0]
-    out[SUPPORT] = total[support, 0]
+    out[IN_FRONT] = total[_COUNTS + residual.IN_FRONT - residual.INLIERS, 0]
+    out[WEIGHT_P] = total[_COUNTS + residual.WEIGHT_P - residual.INLIERS, 0]
+    out[SQUARES_P] = total[_COUNTS + residual.SQUARES_P - residual.INLIERS, 0]
+    out[TERMS] = out[COMPARED] + total[_COUNTS + residual.COUNT_P - residual.INLIERS, 0]
+    out[SUPPORT] = total[_SUPPORT, 0]
 
 
 @kernel
@@ -357,27 +420,30 @@ def _add_error_products(total: Float32, block: Float32, estimated: Int64) -> Non
 
 
 @kernel
-def _correct_points(block: Float32, errors: Float64, radial: bool) -> None:
+def _correct_points(block: Float32, errors: Float32, radial: bool) -> None:
     """Displace the points of a block by camera errors, see `_respond_to_errors`."""
     x = block[residual.POINT * residual.LANES : (residual.POINT + 1) * residual.LANES]
     y = block[(residual.POINT + 1) * residual.LANES : (residual.POINT + 2) * residual.LANES]
     z = block[(residual.POINT + 2) * residual.LANES : (residual.POINT + 3) * residual.LANES]
+    one, zero, tiny = np.float32(1), np.float32(0), np.float32(_EPSILON)
+    offset, scale = errors[OFFSET], errors[SCALE]
+    focal, distortion = errors[FOCAL], errors[DISTORTION]
+    center_x, center_y = errors[CENTER_X], errors[CENTER_Y]
     for k in range(residual.LANES):
         lateral2 = x[k] * x[k] + y[k] * y[k]
-        r2 = max(lateral2 + z[k] * z[k], _EPSILON)  # columns without a point may be 0
-        ray_scale_error = errors[FOCAL] + errors[DISTORTION] * lateral2 / max(z[k] * z[k], _EPSILON)
-        shortening = 0.0
-        if radial:
-            center_term = errors[CENTER_X] * x[k] + errors[CENTER_Y] * y[k]
-            shortening = (ray_scale_error * lateral2 + center_term * z[k]) / r2
-        depth_scale = 1 + errors[OFFSET] / np.sqrt(r2) + errors[SCALE] - shortening
-        x[k] = x[k] * (depth_scale + ray_scale_error) + errors[CENTER_X] * z[k]
-        y[k] = y[k] * (depth_scale + ray_scale_error) + errors[CENTER_Y] * z[k]
+        z2 = z[k] * z[k]
+        r2 = max(lateral2 + z2, tiny)  # columns without a point may be 0
+        ray_scale_error = focal + distortion * lateral2 / max(z2, tiny)
+        center_term = center_x * x[k] + center_y * y[k]
+        shortening = (ray_scale_error * lateral2 + center_term * z[k]) / r2 if radial else zero
+        depth_scale = one + offset / np.sqrt(r2) + scale - shortening
+        x[k] = x[k] * (depth_scale + ray_scale_error) + center_x * z[k]
+        y[k] = y[k] * (depth_scale + ray_scale_error) + center_y * z[k]
         z[k] *= depth_scale
 
 
 @kernel
-def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
+def _distort_projection(block: Float32, errors: Float32, radial: bool) -> None:
     """Move the transformed points of a block to where the erroneous target would measure them.
 
     This is the inverse of `_correct_points`, except for terms of second order by a distortion or by
@@ -386,23 +452,26 @@ def _distort_projection(block: Float32, errors: Float64, radial: bool) -> None:
     xn = block[residual.XN * residual.LANES : (residual.XN + 1) * residual.LANES]
     yn = block[residual.YN * residual.LANES : (residual.YN + 1) * residual.LANES]
     z = block[residual.Z * residual.LANES : (residual.Z + 1) * residual.LANES]
+    one, zero = np.float32(1), np.float32(0)
+    offset, scale = errors[OFFSET], errors[SCALE]
+    focal, distortion = errors[FOCAL], errors[DISTORTION]
+    center_x, center_y = errors[CENTER_X], errors[CENTER_Y]
     for k in range(residual.LANES):
-        if not z[k] > projection_kernels.MIN_DEPTH:  # it is not projected
-            continue
-        range_per_z = np.sqrt(xn[k] * xn[k] + yn[k] * yn[k] + 1)
-        xn[k] -= errors[CENTER_X]
-        yn[k] -= errors[CENTER_Y]
-        lateral2 = xn[k] * xn[k] + yn[k] * yn[k]
-        ray_scale = 1 + errors[FOCAL] + errors[DISTORTION] * lateral2
-        xn[k] /= ray_scale
-        yn[k] /= ray_scale
-        lateral2 = xn[k] * xn[k] + yn[k] * yn[k]
-        shortening = 0.0
-        if radial:
-            center_term = errors[CENTER_X] * xn[k] + errors[CENTER_Y] * yn[k]
-            shortening = ((ray_scale - 1) * lateral2 + center_term) / (lateral2 + 1)
-        z[k] -= errors[OFFSET] / range_per_z
-        z[k] /= 1 + errors[SCALE] - shortening
+        # Only where the point is projected; no branch, so that the loop is vectorised.
+        is_projected = z[k] > np.float32(projection_kernels.MIN_DEPTH)
+        range_per_z = np.sqrt(xn[k] * xn[k] + yn[k] * yn[k] + one)
+        x, y = xn[k] - center_x, yn[k] - center_y
+        ray_scale = one + focal + distortion * (x * x + y * y)
+        x /= ray_scale
+        y /= ray_scale
+        lateral2 = x * x + y * y
+        center_term = center_x * x + center_y * y
+        stretched = (ray_scale - one) * lateral2 + center_term
+        shortening = stretched / (lateral2 + one) if radial else zero
+        depth = (z[k] - offset / range_per_z) / (one + scale - shortening)
+        xn[k] = x if is_projected else xn[k]
+        yn[k] = y if is_projected else yn[k]
+        z[k] = depth if is_projected else z[k]
 
 
 @kernel

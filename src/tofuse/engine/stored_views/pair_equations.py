@@ -20,10 +20,11 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views import shared_error
 from tofuse.engine.stored_views.pair_equation_kernels import marginalise_shared_errors
-from tofuse.engine.stored_views.view_store import SampledView, rows_by_target
+from tofuse.engine.stored_views.view_store import SampledView
 from tofuse.engine.views import residual_kernels
 
-_PAIRS_A_CHUNK = 8
+# Pairs of a chunk, of which the equations, or the errors of patches, are computed.
+_PAIRS_A_CHUNK, _DISCOUNTED_A_CHUNK = 32, 8
 # Approximate number of pairs from which the disagreement of patches is estimated.
 _PAIRS_SAMPLED = 200
 # Residuals that an estimate of scale needs.
@@ -32,6 +33,8 @@ _MIN_COMPARED = 50
 _PRODUCT = np.zeros((kernels.UNKNOWNS, kernels.UNKNOWNS), np.intp)
 _PRODUCT[np.triu_indices(kernels.UNKNOWNS)] = np.arange(kernels.PRODUCTS, kernels.GRADIENT)
 _PRODUCT = np.maximum(_PRODUCT, _PRODUCT.T)
+# Exposure, and scales of distance and of albedo, before they are estimated.
+_USUAL_SCALES = 0.0, 1.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -129,6 +132,11 @@ class DirectedPairs:
             self.sources,
         )
 
+    @property
+    def known_scales(self) -> KnownScales:
+        """The exposures and scales of the pairs."""
+        return KnownScales(self.target, self.source, np.stack(self._scales(), 1))
+
     def put(self, which: Intp, subset: DirectedPairs) -> None:
         """Copy the exposure and scales of a subset into these pairs."""
         for scale, updated in zip(self._scales(), subset._scales(), strict=True):
@@ -138,32 +146,50 @@ class DirectedPairs:
         return self.exposure, self.scale_g, self.scale_p
 
 
+@dataclass(frozen=True, eq=False)
+class KnownScales:
+    """Exposures and scales of directed pairs from an alignment, with which another one begins.
+
+    Attributes
+    ----------
+    target, source
+        (P,) positions of the views.
+    scales
+        (P, 3) exposure, `scale_g` and `scale_p` of `DirectedPairs`.
+    """
+
+    target: Intp
+    source: Intp
+    scales: Float64
+
+    def of(self, target: Intp, source: Intp) -> Float64:
+        """(Q, 3) those of other directed pairs; usual ones where they are unknown."""
+        scales = np.tile(_USUAL_SCALES, (len(target), 1))
+        row = {ts: k for k, ts in enumerate(zip(self.target, self.source, strict=True))}
+        rows = np.array([row.get(ts, -1) for ts in zip(target, source, strict=True)], np.intp)
+        scales[rows >= 0] = self.scales[rows[rows >= 0]]
+        return scales
+
+
 def directed_pairs(
     views: Sequence[SampledView],
     pairs: Intp,
     options: RefineOptions,
-    previous: DirectedPairs | None = None,
+    known: KnownScales | None = None,
 ) -> DirectedPairs:
-    """Return both directions of each pair (M, 2), with the scales in `previous`, if any.
+    """Return both directions of each pair (M, 2), with `known` scales, if any.
 
     `views` (N,) and `options` are as for `joint_alignment.refine`.
     """
     target = np.concatenate([pairs[:, 0], pairs[:, 1]])
     source = np.concatenate([pairs[:, 1], pairs[:, 0]])
-    n = len(target)
     max_scale = np.maximum(3.0, options.max_sigma_m / np.array([v.sigma for v in views]))
-    initial = np.zeros(n), np.ones(n), np.full(n, 0.1)
+    scales = np.tile(_USUAL_SCALES, (len(target), 1)) if known is None else known.of(target, source)
+    exposure, scale_g, scale_p = scales.T.copy()
     photometric = np.array([v.has_albedo for v in views]) & options.photometric
+    scale_p[~(photometric[target] & photometric[source])] = 0.0
     sources = _sources(views, by_patch=options.shared > 0 and bool(photometric.any()))
-    state = DirectedPairs(target, source, *initial, max_scale[source], sources)
-    state.scale_p[~(photometric[target] & photometric[source])] = 0.0
-    if previous is None:
-        return state
-    row = {ts: k for k, ts in enumerate(zip(previous.target, previous.source, strict=True))}
-    old_row = np.array([row.get(ts, -1) for ts in zip(target, source, strict=True)], np.intp)
-    for name in ("exposure", "scale_g", "scale_p"):
-        getattr(state, name)[old_row >= 0] = getattr(previous, name)[old_row[old_row >= 0]]
-    return state
+    return DirectedPairs(target, source, exposure, scale_g, scale_p, max_scale[source], sources)
 
 
 def _sources(views: Sequence[SampledView], *, by_patch: bool) -> kernels.SourcePoints:
@@ -214,42 +240,51 @@ def evaluate(
     by_patch
         Whether to sum over patches as well, for `discount_shared`.
     """
-    T_target_source = se3.inverse(poses[state.target]) @ poses[state.source]
-    rows = np.empty((len(state.target), kernels.SIZE))
+    # All sources of a target in succession, so that it stays in the cache.
+    order = np.argsort(state.target, kind="stable")
+    target, source = state.target[order], state.source[order]
+    exposure, scale_g, scale_p = (column[order] for column in state._scales())
+    T_target_source = se3.inverse(poses[target]) @ poses[source]
+    rows = np.empty((len(target), kernels.SIZE))
     sums = np.empty((len(rows), shared_error.PATCHES if by_patch else 0, kernels.PATCH_SIZE))
     cosine = float(np.cos(options.max_angle))
-    # All sources of a target in succession, so that it stays in the cache.
-    by_target = rows_by_target(state.target)
+    targets, begin = np.unique(target, return_index=True)
+    ends = np.append(begin, len(target))
 
     def work(a: int, b: int) -> None:
-        for k, pairs in by_target[a:b]:
-            target = views[k]
-            pair_rows = np.empty((len(pairs), kernels.SIZE))
-            patch_sums = np.empty((len(pairs), *sums.shape[1:]))
+        for first in range(a, b, kernels.TARGETS):
+            last = min(first + kernels.TARGETS, b)
+            used = [views[k] for k in targets[first:last]]
+            images = [view.target_image for view in used]
+            images += images[-1:] * (kernels.TARGETS - len(images))
+            pairs = slice(ends[first], ends[last])
             kernels.target_equations(
                 state.sources,
-                state.source[pairs],
-                target.target_image,
+                source[pairs],
+                tuple(images),
+                kernels.TargetViews(
+                    np.array([view.measures_range for view in used]),
+                    np.array([view.target_scale for view in used]),
+                    ends[first : last + 1] - ends[first],
+                ),
                 T_target_source[pairs],
                 kernels.PairResiduals(
-                    state.exposure[pairs],
-                    state.scale_g[pairs],
-                    state.scale_p[pairs],
+                    exposure[pairs],
+                    scale_g[pairs],
+                    scale_p[pairs],
                     stage.inflation_m,
                     options.robust,
                     cosine,
                 ),
                 errors,
                 fixed_errors,
-                target.measures_range,
-                target.target_scale,
-                pair_rows,
-                patch_sums,
+                rows[pairs],
+                sums[pairs],
             )
-            rows[pairs], sums[pairs] = pair_rows, patch_sums
 
-    run_chunks(work, len(by_target), -(-len(rows) // _PAIRS_A_CHUNK))
-    state.rows, state.sums = rows, sums
+    run_chunks(work, len(targets), -(-len(rows) // _PAIRS_A_CHUNK))
+    state.rows, state.sums = np.empty_like(rows), np.empty_like(sums)
+    state.rows[order], state.sums[order] = rows, sums
 
 
 def depends_on_patches(state: DirectedPairs, options: RefineOptions) -> bool:
@@ -285,7 +320,7 @@ def discount_shared(
             state.sums, correlation, variance[a:b], photometric[a:b], state.rows
         )
 
-    run_chunks(work, len(photometric), -(-len(photometric) // _PAIRS_A_CHUNK))
+    run_chunks(work, len(photometric), -(-len(photometric) // _DISCOUNTED_A_CHUNK))
 
 
 def without_exposure(state: DirectedPairs, errors: Sequence[int] = ()) -> tuple[Float64, Float64]:
@@ -318,8 +353,9 @@ def rescale(state: DirectedPairs, stage: Round, options: RefineOptions) -> None:
     """Estimate the sigmas of each pair from its residuals, as the tracker does."""
     counts = np.ascontiguousarray(state.rows[:, kernels.HISTOGRAM :])
     enough = counts.sum(1) >= _MIN_COMPARED
-    distance_scale = np.array([steps.scale_of_distances(row) for row in counts[enough]])
-    state.scale_g[enough] = np.clip(distance_scale, 0.7, state.max_scale[enough])
+    distance_scale = np.empty(len(counts))
+    steps.scales_of_distances(counts, distance_scale)
+    state.scale_g[enough] = np.clip(distance_scale, 0.7, state.max_scale)[enough]
     weight = state.rows[:, kernels.WEIGHT_P]
     mean_square = state.rows[:, kernels.SQUARES_P] / np.maximum(weight, 1e-9)
     albedo_scale = np.sqrt(mean_square / tukey.consistency(options.robust))
