@@ -14,7 +14,6 @@ from itertools import accumulate, pairwise
 from typing import Annotated, ClassVar, Protocol
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.special import chdtri
 
 from tofuse.engine.arrays import Bool, Float64, Intp
@@ -386,6 +385,8 @@ class _Comparison:
         the disagreement.
         """
         misfit = self._misfit
+        from scipy.optimize import minimize  # slow to import
+
         weight = 1 / self.spans  # about as many are independent as don't overlap
 
         def cost(logarithms: Float64) -> float:
