@@ -18,13 +18,10 @@ async function startViewer(box, scene, bus) {
     points = { ...shared, count: scene.count };
     if (scene.model.faces) {
       const faces = await unpack(scene.model.faces, Uint32Array, 3);
-      const picture = scene.model.texture ? await painter.picture(scene.model.texture) : null;
-      if (picture) Object.assign(shared, { picture, uv: await buffered(scene.model.uv, Uint16Array, 2) });
       surface = { ...shared, faces: painter.indices(faces), count: faces.length, measured: faces.length - 3 * scene.model.filled };
       for (const most of COARSE) {
         const fewer = faces.length > 3 * most ? clustered(place, faces, scene.extent, most) : faces;
-        // Merged vertices are in other charts of the texture: their own colours are shown.
-        coarse.push({ ...shared, uv: fewer === faces ? shared.uv : null, faces: painter.indices(fewer), count: fewer.length });
+        coarse.push({ ...shared, merged: fewer !== faces, faces: painter.indices(fewer), count: fewer.length });
       }
     }
   }
@@ -236,6 +233,14 @@ async function startViewer(box, scene, bus) {
   recolor();
   view.look(START, scene.framed);
   new ResizeObserver(draw).observe(canvas);
+
+  // Until the texture is decoded, which takes a while, the surface has the colours of its vertices.
+  // So it keeps them where vertices are merged, as these are in several charts of the texture.
+  const picture = surface && scene.model.texture ? await painter.picture(scene.model.texture) : null;
+  if (!picture) return;
+  const uv = await buffered(scene.model.uv, Uint16Array, 2);
+  for (const set of [surface, ...coarse]) if (!set.merged) Object.assign(set, { picture, uv });
+  draw();
 }
 
 // What a page without switches shows; points where there is no surface.
