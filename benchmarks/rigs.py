@@ -290,7 +290,7 @@ def real() -> None:
     for camera, T in zip(rig.cameras[1:], reference[1:], strict=True):
         e = se3.log(se3.inverse(camera.T_rig_camera) @ T)
         C, R = camera.covariance, camera.random_covariance
-        metres, radians = se3.largest_sigmas(camera)
+        metres, radians = se3.largest_sigmas(C)
         print(
             f"{camera.name:<16}{1e3 * np.linalg.norm(e[:3]):7.1f}"
             f"{np.degrees(np.linalg.norm(e[3:])):7.2f}{1e3 * metres:7.1f}{np.degrees(radians):7.2f}"

@@ -181,7 +181,9 @@ class _Isotropic(Problem):
 
     def _error_motions(self, poses: Float64) -> Float64:
         i, j = self.pairs.T
-        return np.asarray(self._Z_inverse @ (se3.inverse(poses[i]) @ poses[j]), np.float64)
+        return np.asarray(
+            se3.inverse(self.measurements) @ (se3.inverse(poses[i]) @ poses[j]), np.float64
+        )
 
 
 def isotropic_weights(information: Float64) -> tuple[Float64, Float64]:

@@ -9,9 +9,11 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import robust
+from tofuse.engine.graph import edge_kernels, robust
 from tofuse.engine.graph.graph import ROUNDING, Gravity
 from tofuse.engine.graph.sparse import Factor, PairSystem
+
+_MAX_ANGLE = 3.0  # rad, of errors by the kernel
 
 
 class Problem:
@@ -31,7 +33,6 @@ class Problem:
     ) -> None:
         self.fixed, self.information, self.gravity = fixed, information, gravity
         self.pairs, self.measurements = pairs, measurements
-        self._Z_inverse = se3.inverse(measurements)
         n = len(fixed)
         all_pairs, all_fixed = pairs, fixed
         self.unary: tuple[Float64, Float64] | None = None
@@ -65,8 +66,13 @@ class Problem:
 
     def errors(self, poses: Float64) -> tuple[Float64, Float64]:
         """Return the errors of the edges (m, 6), and those of gravity (g, 3) over their sigma."""
-        i, j = self.pairs.T
-        e = se3.log(self._Z_inverse @ (se3.inverse(poses[i]) @ poses[j]))
+        e = np.empty((len(self.pairs), 6))
+        edge_kernels.errors(self.measurements, poses, self.pairs, e)
+        # Near half a turn only the logarithm by quaternions is exact.
+        turned = np.flatnonzero((e[:, 3:] ** 2).sum(1) > _MAX_ANGLE**2)
+        i, j = self.pairs[turned].T
+        Z_inverse = se3.inverse(self.measurements[turned])
+        e[turned] = se3.log(Z_inverse @ (se3.inverse(poses[i]) @ poses[j]))
         if self.gravity is None:
             return e, np.zeros((0, 3))
         return e, (self._observed_down(poses) - [0, 0, 1]) / self.gravity.sigma[:, None]
@@ -87,9 +93,8 @@ class Problem:
         self, poses: Float64, e: Float64, down: Float64, weights: Float64
     ) -> tuple[Any, Float64]:
         """Return the normal equations (matrix, gradient) at the poses of the given errors."""
-        J = se3.jacobian_inverse(e)
-        JtW = np.swapaxes(J, 1, 2) @ (weights[:, None, None] * self.information)
-        H, g = JtW @ J, (JtW @ e[..., None])[..., 0]
+        H, g = np.empty((len(e), 6, 6)), np.empty((len(e), 6))
+        edge_kernels.normal_equations(e, self.information, weights, H, g)
         i, j = self.all_pairs.T
         T_i_j = se3.inverse(poses[i]) @ poses[j]
         if self.gravity is not None:

@@ -1,0 +1,50 @@
+"""Kernels of the edges of a pose graph, against the same in NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tofuse.engine.geometry import se3
+from tofuse.engine.graph import edge_kernels
+from tofuse.engine.graph.minimisation import Problem
+
+# From rounding to half a turn, on both sides of each series.
+ANGLES = np.array([0, 1e-9, 1e-5, 0.019, 0.021, 0.099, 0.101, 1.0, 2.9, 3.05, np.pi - 1e-7])
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(5)
+
+
+def twists(rng, angles):
+    axes = rng.normal(size=(len(angles), 3))
+    axes *= (angles / np.linalg.norm(axes, axis=1))[:, None]
+    return np.concatenate([rng.normal(size=(len(angles), 3)), axes], 1)
+
+
+def test_normal_equations_are_those_of_the_jacobian(rng):
+    e = twists(rng, ANGLES[:-1])  # the last cancels in NumPy
+    root = rng.normal(size=(len(e), 6, 6))
+    information, weights = root @ np.swapaxes(root, 1, 2), rng.uniform(0, 1, len(e))
+    H, g = np.empty((len(e), 6, 6)), np.empty((len(e), 6))
+    edge_kernels.normal_equations(e, information, weights, H, g)
+    J = se3.jacobian_inverse(e)
+    JtW = np.swapaxes(J, 1, 2) @ (weights[:, None, None] * information)
+    scale = np.abs(JtW @ J).max()
+    np.testing.assert_allclose(H, JtW @ J, rtol=1e-9, atol=1e-11 * scale)
+    np.testing.assert_allclose(g, (JtW @ e[..., None])[..., 0], rtol=1e-9, atol=1e-10 * scale)
+
+
+def test_errors_are_logarithms(rng):
+    expected = twists(rng, ANGLES)
+    count = len(expected)
+    poses = se3.exp(rng.normal(size=(count, 6)))
+    measurements = se3.exp(rng.normal(size=(count, 6)))
+    poses = np.concatenate([poses, poses @ measurements @ se3.exp(expected)])
+    pairs = np.stack([np.arange(count), count + np.arange(count)], 1)
+    fixed = np.arange(2 * count) == 0
+    problem = Problem(pairs, measurements, np.tile(np.eye(6), (count, 1, 1)), fixed, None)
+    np.testing.assert_allclose(problem.errors(poses)[0], expected, atol=1e-6)
+    np.testing.assert_allclose(problem.errors(poses)[0][:-1], expected[:-1], atol=1e-11)
