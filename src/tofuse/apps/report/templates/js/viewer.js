@@ -235,7 +235,7 @@ async function startViewer(box, scene, bus) {
   new ResizeObserver(draw).observe(canvas);
 
   // Until the texture is decoded, which takes a while, the surface has the colours of its vertices.
-  // So it keeps them where vertices are merged, as these are in several charts of the texture.
+  // Merged vertices, which are in several charts of the texture, keep theirs.
   const picture = surface && scene.model.texture ? await painter.picture(scene.model.texture) : null;
   if (!picture) return;
   const uv = await buffered(scene.model.uv, Uint16Array, 2);
