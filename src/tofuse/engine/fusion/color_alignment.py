@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp, UInt8
+from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
 from tofuse.engine.views import Projection
 
@@ -65,13 +67,16 @@ def aligned_poses(points: Float32, poses: Float64, shown: Sequence[Shown]) -> Fl
         What each of the views shows.
     """
     chosen = np.arange(0, len(points), -(-len(points) // _MAX_POINTS))
-    views = [
-        _View.of(points, T, view, chosen) for T, view in zip(se3.inverse(poses), shown, strict=True)
-    ]
+    views = run_all(
+        [
+            partial(_View.of, points, T, view, chosen)
+            for T, view in zip(se3.inverse(poses), shown, strict=True)
+        ]
+    )
     tested = np.arange(len(chosen)) % 4 == 3
     xi = np.zeros((len(views), 6))
     for blur in _BLURS:
-        signals = [view.signal(blur) for view in views]
+        signals = run_all([partial(view.signal, blur) for view in views])
         for _ in range(_ITERATIONS):
             for k, (row, error, slope) in enumerate(_differences(views, signals, xi, ~tested)):
                 if len(row) >= _MIN_POINTS:
@@ -139,6 +144,16 @@ class _View:
         slopes = (cv2.Scharr(unit, cv2.CV_32F, *axis, scale=1 / 32) for axis in ((1, 0), (0, 1)))
         return np.asarray(cv2.merge([unit, *slopes]), np.float32)
 
+    def sampled(self, signal: Float32, twist: Float64, used: Bool) -> tuple[Intp, Float64, Float64]:
+        """Return the used points (K,), and there `signal` (K, 3) and the derivatives (K, 2, 6)."""
+        own = used[self.rows]
+        rows, slope = self.rows[own], self.slope[own]
+        if not len(rows):
+            return rows, np.zeros((0, 3)), slope
+        u, v = (self.pixels[own] + slope @ twist).astype(np.float32).T
+        values = cv2.remap(signal, u, v, cv2.INTER_LINEAR)
+        return rows, values.reshape(-1, 3).astype(float), slope
+
 
 def _differences(
     views: Sequence[_View], signals: Sequence[Float32], xi: Float64, used: Bool
@@ -147,17 +162,16 @@ def _differences(
 
     The difference (K,) is from the mean of the others, with its derivatives (K, 6).
     """
-    sampled, total, count = [], np.zeros(len(used)), np.zeros(len(used), int)
-    for view, signal, twist in zip(views, signals, xi, strict=True):
-        own = used[view.rows]
-        rows, slope = view.rows[own], view.slope[own]
-        values = np.zeros((0, 3))
-        if len(rows):
-            u, v = (view.pixels[own] + slope @ twist).astype(np.float32).T
-            values = cv2.remap(signal, u, v, cv2.INTER_LINEAR).reshape(-1, 3).astype(float)
+    sampled = run_all(
+        [
+            partial(view.sampled, signal, twist, used)
+            for view, signal, twist in zip(views, signals, xi, strict=True)
+        ]
+    )
+    total, count = np.zeros(len(used)), np.zeros(len(used), int)
+    for rows, values, _ in sampled:
         total[rows] += values[:, 0]
         count[rows] += 1
-        sampled.append((rows, values, slope))
     out = []
     for rows, values, slope in sampled:
         shared = count[rows] > 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, UInt8
 from tofuse.engine.cameras import ray_lengths
-from tofuse.engine.compute import job_pool, run_chunks
+from tofuse.engine.compute import job_pool, run_all, run_chunks
 from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame
-from tofuse.engine.fusion.atlas import Atlas, chart_atlas, unwrap
+from tofuse.engine.fusion.atlas import MARGIN, Atlas, chart_atlas, unwrap
 from tofuse.engine.fusion.atlas_kernels import (
     NO_TRIANGLE,
     Canvas,
     Pictures,
     SeenBy,
+    draw_triangles,
     finish,
     paint_triangles,
     weigh_points,
@@ -30,7 +31,7 @@ from tofuse.engine.fusion.display_surface import TOLERANCE_FRACTION, TOLERANCE_M
 from tofuse.engine.fusion.drawing import display_colors
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.geometry import KdTree, se3
-from tofuse.engine.views import Projection
+from tofuse.engine.views import Projection, projection_of
 
 # Width of the margin in which a view's weight decreases, as a fraction of the image's height; how
 # much of it is left at an edge of depth; and pixels next to unknown colour that are not used.
@@ -38,6 +39,7 @@ _BORDER, _AT_EDGE, _ERODED = 0.08, 0.03, 2
 _COARSE = 96  # pixels of the longer side of the images that are blended widely
 _CANDIDATES = 8  # views that paint a triangle
 _CHUNKS = 16
+_BAND, _REACH = 128, 3  # rows of a texture that are painted at once, and around a triangle
 _MAX_SAMPLES = 20_000  # vertices at which exposures are compared
 _CHUNK_TEXELS = 1 << 14
 # Robust limit of residuals of the log intensity, and iterations.
@@ -115,12 +117,13 @@ class TextureView:
 
         None if it has neither.
         """
-        z = np.asarray(frame.z, np.float32)
-        projection = Projection.of(frame.camera, 1)
+        z = np.nan_to_num(np.asarray(frame.z, np.float32))
+        projection = projection_of(frame.camera, 1)
         if frame.color_image is not None and frame.color_registered:
             image = frame.color_image if image is None else image
             # Else the colour camera didn't see it.
-            known = np.asarray(frame.color_image.any(-1), np.bool_)
+            red, green, blue = np.moveaxis(frame.color_image, -1, 0)
+            known = np.asarray((red | green | blue) > 0, np.bool_)
             return cls(z, known, np.ascontiguousarray(image), projection)
         light = albedo(frame)
         if light is None:
@@ -269,10 +272,9 @@ class _Seen:
             tested = SeenBy(view.z, view.reach, view.projection.lookup, view.projection.frame)
             limits = (TOLERANCE_M, TOLERANCE_FRACTION)
             scene = (points, normals, tested, T_camera_world, *limits, weights[k], pixels[k])
-            run_chunks(lambda a, b: weigh_points(*scene, a, b), len(points), _CHUNKS)
+            weigh_points(*scene, 0, len(points))
 
-        for k, T_camera_world in enumerate(se3.inverse(poses)):
-            weigh(k, T_camera_world)
+        run_all([partial(weigh, k, T) for k, T in enumerate(se3.inverse(poses))])
         return cls(views, poses, weights, pixels)
 
     def aligned(self, mesh: Mesh) -> _Seen:
@@ -309,13 +311,22 @@ class _Seen:
         -1 where there is none: a view may show a triangle in part, but a whole one is needed to lay
         out the triangle as it appears there.
         """
-        corners = self.weights[:, faces]
-        score, whole = corners.sum(-1), (corners > 0).all(-1)
         count = min(_CANDIDATES, len(self.views))
-        best = np.argsort(-(score + whole * score.max(initial=0.0)), axis=0, kind="stable")[:count]
-        shown = np.take_along_axis(score, best, 0) > 0
-        label = np.where(np.take_along_axis(whole, best[:1], 0)[0], best[0], -1)
-        return np.where(shown, best, -1).T.astype(np.int32), label.astype(np.int32)
+        ranked = np.empty((len(faces), count), np.int32)
+        label = np.empty(len(faces), np.int32)
+
+        def rank(a: int, b: int) -> None:
+            corners = self.weights[:, faces[a:b]]
+            score, whole = corners.sum(-1), (corners > 0).all(-1)
+            # Whole ones first, then the others; both by their score.
+            key = np.where(whole, -score, 1 / np.maximum(score, np.float32(1e-30)))
+            best = np.argsort(key, axis=0, kind="stable")[:count]
+            shown = np.take_along_axis(score, best, 0) > 0
+            ranked[a:b] = np.where(shown, best, -1).T
+            label[a:b] = np.where(np.take_along_axis(whole, best[:1], 0)[0], best[0], -1)
+
+        run_chunks(rank, len(faces), _CHUNKS)
+        return ranked, label
 
     def image_pixels(self, label: Int32, faces: Int32) -> Float32:
         """Return where corners (M, 3, 2) are in the images of the triangles' labels (M,)."""
@@ -332,33 +343,46 @@ def _scale(image: NDArray[np.generic], z: Float32) -> Float64:
 
 
 def _painted(mesh: Mesh, seen: _Seen, gains: Float64, candidates: Int32, atlas: Atlas) -> UInt8:
-    """Return the image (S, S, 3) of a texture."""
-    shape = (atlas.size, atlas.size)
-    owner, coordinates = atlas.drawn()
-    canvas = Canvas(
-        owner,
-        coordinates,
-        *(np.zeros((*shape, *more), np.float32) for more in ((), (3,), (), (3,))),
-    )
-    corners = atlas.texels[atlas.faces]
-    points, faces = np.ascontiguousarray(mesh.vertices), mesh.faces
+    """Return the image (S, S, 3) of a texture.
 
-    def paint(k: int, T_camera_world: Float64) -> None:
-        view = seen.views[k]
-        triangles = np.flatnonzero((candidates == k).any(1)).astype(np.int32)
-        coarse, lens = view.coarse, view.projection
-        scales = np.stack([_scale(view.image, view.z), _scale(coarse, view.z)])
-        pictures = Pictures(view.image, coarse, scales, gains[k], lens.lookup, lens.frame)
-        scene = (corners, faces, points, seen.weights[k], pictures, T_camera_world, canvas)
-        run_chunks(lambda a, b: paint_triangles(triangles, *scene, a, b), len(triangles), _CHUNKS)
-
-    for k, T_camera_world in enumerate(se3.inverse(seen.poses)):
-        paint(k, T_camera_world)
-    image = np.zeros((*shape, 3), np.uint8)
+    It is painted in bands of rows, as a canvas has ten times the size of the image.
+    """
+    image = np.zeros((atlas.size, atlas.size, 3), np.uint8)
+    owned = np.zeros(image.shape[:2], np.bool_)
+    all_corners = atlas.texels[atlas.faces]
+    top, bottom = all_corners[..., 1].min(1) - _REACH, all_corners[..., 1].max(1) + _REACH
+    points, T_camera_world = np.ascontiguousarray(mesh.vertices), se3.inverse(seen.poses)
     unseen = np.asarray(~(seen.weights > 0).any(0), np.bool_)
     base = _base_colors(mesh)
-    run_chunks(lambda a, b: finish(canvas, faces, unseen, base, image, a, b), len(image), _CHUNKS)
-    return _filled(image, owner != NO_TRIANGLE)
+
+    def pictures(k: int) -> Pictures:
+        view = seen.views[k]
+        coarse, lens = view.coarse, view.projection
+        scales = np.stack([_scale(view.image, view.z), _scale(coarse, view.z)])
+        return Pictures(view.image, coarse, scales, gains[k], lens.lookup, lens.frame)
+
+    of_views = run_all([partial(pictures, k) for k in range(len(seen.views))])
+
+    def paint(first: int, last: int) -> None:
+        rows = np.flatnonzero((bottom >= first) & (top < last))
+        corners, faces = all_corners[rows] - np.array([0, first], np.float32), mesh.faces[rows]
+        shape = (last - first, atlas.size)
+        owner = np.full(shape, NO_TRIANGLE, np.int32)
+        sums = (np.zeros((*shape, *more), np.float32) for more in ((2,), (), (3,), (), (3,)))
+        canvas = Canvas(owner, *sums)
+        draw_triangles(corners, MARGIN, owner, canvas.barycentric)
+        views = candidates[rows]
+        order = np.argsort(views, axis=None, kind="stable")
+        bounds = np.searchsorted(views.ravel()[order], np.arange(len(of_views) + 1))
+        for k, picture in enumerate(of_views):
+            triangles = (order[bounds[k] : bounds[k + 1]] // views.shape[1]).astype(np.int32)
+            scene = (corners, faces, points, seen.weights[k], picture, T_camera_world[k], canvas)
+            paint_triangles(triangles, *scene, 0, len(triangles))
+        finish(canvas, faces, unseen, base, image[first:last], 0, last - first)
+        owned[first:last] = owner != NO_TRIANGLE
+
+    run_chunks(paint, atlas.size, -(-atlas.size // _BAND))
+    return _filled(image, owned)
 
 
 def _base_colors(mesh: Mesh) -> UInt8:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.engine.arrays import UInt8
 from tofuse.engine.color import ColorView
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import RangeFrame, Recording, Source
+from tofuse.engine.frames import Frame, RangeFrame, Recording, Source
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import PoseGraph
 from tofuse.engine.sensor import Corrector
@@ -55,21 +55,21 @@ class ColorFrames:
             if depths.get(index, 0.0) > 0:
                 store.push(_Frame(index, depths[index]), pose)
         speeds = self._speeds(graph)
-        views = []
-        for item in store.views:
-            try:
-                frame = self.recording.source.read(item.index)
-            except InputError:  # no longer readable
-                continue
+        chosen = np.array([item.index for item in store.views], np.intp)
+        frames = replace(self.recording, indices=chosen)
+
+        def view_of(frame: Frame) -> ColorView:
             assert isinstance(frame, RangeFrame)
             full = full_image(self.recording, frame)
             color = frame.color_image if full is None else full
+            assert color is not None
             for corrector in self.correctors:
                 frame = corrector.apply(frame)
-            assert color is not None
             assert isinstance(frame, RangeFrame)
-            views.append(ColorView.of(frame, color, speeds[item.index]))
-        return views
+            return ColorView.of(frame, color, speeds[frame.index])
+
+        # Frames that are no longer readable have no view.
+        return [view for _, view in frames.read_with(view_of) if view is not None]
 
     def _speeds(self, graph: PoseGraph) -> dict[int, tuple[float, float]]:
         """Return the speeds of the camera, m/s and rad/s, by frame index."""

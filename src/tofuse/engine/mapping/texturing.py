@@ -10,8 +10,7 @@ from threadpoolctl import threadpool_limits
 from tofuse.engine.arrays import Bool
 from tofuse.engine.compute import job_pool
 from tofuse.engine.compute import threads as use_threads
-from tofuse.engine.errors import UnreadableFrameError
-from tofuse.engine.frames import RangeFrame, Recording, evenly_spaced
+from tofuse.engine.frames import Frame, RangeFrame, Recording, evenly_spaced
 from tofuse.engine.fusion import display_surface, texture
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping.color_frames import full_image, origin_of
@@ -71,29 +70,35 @@ def make_texture(
     correctors = CameraErrors.made_with(result.config)
     progress = progress or Silent()
     progress.stage("painting", len(frame_positions))
+
+    def prepared(frame: Frame) -> tuple[RangeFrame, texture.TextureView | None] | None:
+        for corrector in correctors:
+            frame = corrector.apply(frame)
+        if not isinstance(frame, RangeFrame):
+            return None
+        if frame.color_image is None and not required:
+            return frame, None
+        return frame, texture.TextureView.of(frame, full_image(recording, frame, most_pixels))
+
     views: list[texture.TextureView] = []
     poses = []
     witnesses: list[display_surface.Witness] = []
+    selected = replace(recording, indices=recording.indices[frame_positions])
     # The surface is reduced while images are read.
     with job_pool(1, "tofuse-texture") as background:
         reduced = background.submit(mesh.clustered, _FACES)
-        for k in frame_positions:
+        poses_of_frames = result.trajectory[frame_positions]
+        for (_, read), T in zip(selected.read_with(prepared), poses_of_frames, strict=True):
             progress.advance()
-            try:
-                frame = recording[int(k)]
-            except UnreadableFrameError:
+            if read is None:
                 continue
-            for corrector in correctors:
-                frame = corrector.apply(frame)
-            if not isinstance(frame, RangeFrame):
+            frame, view = read
+            if view is None:
+                witnesses.append(display_surface.Witness.of(frame, T))
                 continue
-            witnesses.append(display_surface.Witness.of(frame, result.trajectory[k]))
-            if frame.color_image is None and not required:
-                continue
-            view = texture.TextureView.of(frame, full_image(recording, frame, most_pixels))
-            if view is not None:
-                views.append(view)
-                poses.append(result.trajectory[k])
+            witnesses.append(display_surface.Witness(view.z, frame.camera, T))
+            views.append(view)
+            poses.append(T)
     if not views:
         return None
     # BLAS results depend on its number of threads; those of our kernels don't.

@@ -194,7 +194,7 @@ def at_size(mask: Bool, frame: RangeFrame) -> Bool:
     """Return the mask of a prepared view at the size of the frame's image."""
     rows, columns = frame.valid.shape
     step = columns // mask.shape[1]
-    large = np.kron(mask, np.ones((step, step), np.bool_))
+    large = mask.repeat(step, 0).repeat(step, 1)
     out = np.zeros((rows, columns), np.bool_)
     out[: large.shape[0], : large.shape[1]] = large[:rows, :columns]
     return out

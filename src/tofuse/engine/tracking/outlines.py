@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from tofuse.engine.arrays import Bool, Float32, Float64
+from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.tracking.moving_objects import stride_of
 from tofuse.engine.views import PreparedView
@@ -55,9 +55,11 @@ def moved_fraction(
     outline = moving & (z > 0) & (other_seen.z > 0)
     outline &= cv2.dilate((~moving).view(np.uint8), _SQUARE[1]) > 0
     outline &= cv2.dilate(beside.view(np.uint8), _SQUARE[_NEAR]) > 0
-    edge = seen.are_connected(beside) != other_seen.are_connected(beside)
+    at = np.nonzero(outline)
+    edge = seen.are_connected(beside, at) != other_seen.are_connected(beside, at)
     count, labels = cv2.connectedComponents(moving.view(np.uint8), connectivity=4)
-    lengths, edges = (np.bincount(labels[m], minlength=count) for m in (outline, outline & edge))
+    lengths = np.bincount(labels[at], minlength=count)
+    edges = np.bincount(labels[at][edge], minlength=count)
     moved = (edges >= _MIN_OUTLINED * lengths) & (lengths > 0)
     moved[0] = False
     return float((moved[labels] & (z > 0)).sum() / max((z > 0).sum(), 1))
@@ -71,18 +73,25 @@ class _Surfaces:
     rays: Float32
     planes: Float32
 
-    def are_connected(self, beside: Bool) -> Bool:
-        """Return the (A, B) cells whose surface continues to one of the cells `beside` near it."""
-        connected = np.zeros(self.z.shape, np.bool_)
-        rows, columns = self.z.shape
+    def are_connected(self, beside: Bool, at: tuple[Intp, ...]) -> Bool:
+        """Return which cells continue to one of the cells `beside` near them.
+
+        Parameters
+        ----------
+        beside
+            (A, B) cells.
+        at
+            (K,) rows and (K,) columns of the cells that are tested.
+        """
+        connected = np.zeros(len(at[0]), np.bool_)
         inverse = np.pad(np.where(beside, 1 / np.maximum(self.z, 1e-6), 0), _NEAR)
         x, y = (np.pad(self.rays[..., k], _NEAR) for k in (0, 1))
-        a, b, c, _ = np.moveaxis(self.planes, -1, 0)
+        z, (a, b, c, _) = self.z[at], self.planes[at].T
         for down in range(2 * _NEAR + 1):
             for right in range(2 * _NEAR + 1):
-                near = np.s_[down : down + rows, right : right + columns]
+                near = at[0] + down, at[1] + right
                 known = inverse[near] > 0
-                depth = np.abs(inverse[near] * self.z - 1) < _MAX_GAP
+                depth = np.abs(inverse[near] * z - 1) < _MAX_GAP
                 plane = a * x[near] + b * y[near] + c
                 connected |= known & (depth | (np.abs(plane - inverse[near]) < _MAX_GAP * plane))
         return connected
