@@ -58,10 +58,7 @@ class Priors:
 
     def equations(self, T_i_j: Float64) -> tuple[Float64, Float64]:
         """Return the normal equations (M, 6, 6), (M, 6) at relative poses (M, 4, 4)."""
-        e = se3.log(se3.inverse(self.measured) @ T_i_j)
-        J = se3.jacobian_inverse(e)
-        JtW = np.swapaxes(J, 1, 2) @ self.information
-        return JtW @ J, (JtW @ e[..., None])[..., 0]
+        return sparse.equations(se3.log(se3.inverse(self.measured) @ T_i_j), self.information)
 
 
 def weak_prior(n: int) -> tuple[Float64, Float64]:
