@@ -281,14 +281,16 @@ def align_views(
     motions: list[float] = []
     error_changes = [np.inf]
     overlapping = _overlapping(views, poses, options, bodies) if pairs is None else pairs
-    state = pair_equations.directed_pairs(views, overlapping, options, scales)
+    known = None if scales is None else scales.of(overlapping)
+    state = pair_equations.directed_pairs(views, overlapping, options, known)
     system = _system(state, len(views), priors, bodies)
     motion_since_overlaps = 0.0
     earlier_error_step = np.zeros(kernels.ERRORS)
     for stage in options.rounds:
         if motion_since_overlaps >= _MAX_MOTION:
             overlapping = _overlapping(views, poses, options, bodies)
-            state = pair_equations.directed_pairs(views, overlapping, options, state.known_scales)
+            known = state.known_scales.of(overlapping)
+            state = pair_equations.directed_pairs(views, overlapping, options, known)
             system = _system(state, len(views), priors, bodies)
             motion_since_overlaps = 0.0
         for _ in range(stage.iterations if len(state.target) else 0):
@@ -333,7 +335,8 @@ def support_of(
     options: pair_equations.RefineOptions,
 ) -> Support:
     """Support of the same pairs at other poses (N, 4, 4), with the same sigmas."""
-    state = pair_equations.directed_pairs(views, refined.pairs, options, refined.scales)
+    scales = refined.scales.of(refined.pairs)
+    state = pair_equations.directed_pairs(views, refined.pairs, options, scales)
     fixed_errors = (refined.errors == 0).astype(np.int64)
     return _support(views, poses, refined.errors, fixed_errors, state, options.rounds[-1], options)
 
@@ -384,10 +387,7 @@ def align_pairs(
     ends = np.arange(2 * count).reshape(-1, 2)
     poses = np.tile(np.eye(4), (2 * count, 1, 1))
     poses[1::2] = T_i_j
-    i, j = pairs.T
-    known = scales.of(np.concatenate([i, j]), np.concatenate([j, i]))
-    doubled = pair_equations.KnownScales(ends.T.ravel(), ends[:, ::-1].T.ravel(), known)
-    state = pair_equations.directed_pairs(views, ends, options, doubled)
+    state = pair_equations.directed_pairs(views, ends, options, scales.of(pairs))
     fixed_errors, stage = np.ones(len(errors), np.int64), options.rounds[-1]
     active = np.arange(count)
     for _ in range(_PAIR_ITERATIONS):
