@@ -20,7 +20,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views import shared_error
 from tofuse.engine.stored_views.pair_equation_kernels import marginalise_shared_errors
-from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.engine.stored_views.view_store import SampledView, by_target
 from tofuse.engine.views import residual_kernels
 
 # Pairs of a chunk, of which the equations, or the errors of patches, are computed.
@@ -246,16 +246,13 @@ def evaluate(
     by_patch
         Whether to sum over patches as well, for `discount_shared`.
     """
-    # All sources of a target in succession, so that it stays in the cache.
-    order = np.argsort(state.target, kind="stable")
+    order, targets, ends = by_target(state.target)
     target, source = state.target[order], state.source[order]
     exposure, scale_g, scale_p = (column[order] for column in state._scales())
     T_target_source = se3.inverse(poses[target]) @ poses[source]
     rows = np.empty((len(target), kernels.SIZE))
     sums = np.empty((len(rows), shared_error.PATCHES if by_patch else 0, kernels.PATCH_SIZE))
     cosine = float(np.cos(options.max_angle))
-    targets, begin = np.unique(target, return_index=True)
-    ends = np.append(begin, len(target))
 
     def work(a: int, b: int) -> None:
         for first in range(a, b, kernels.TARGETS):
