@@ -22,7 +22,6 @@ from tofuse.engine.graph import external_sensors, robust, sparse
 from tofuse.engine.stored_views import SampledView, overlaps, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 
-WEAK = 1e-3  # information of a weak prior in `UNITS`
 DAMPING = 1e-6  # fraction of the diagonal that is added to it
 
 
@@ -63,7 +62,7 @@ class Priors:
 
 def weak_prior(n: int) -> tuple[Float64, Float64]:
     """Return equations (n, 6, 6), (n, 6) that just keep unconstrained poses in place."""
-    return np.tile(np.diag(WEAK / projective.UNITS**2), (n, 1, 1)), np.zeros((n, 6))
+    return np.tile(np.diag(projective.WEAK / projective.UNITS**2), (n, 1, 1)), np.zeros((n, 6))
 
 
 _ERROR_UNIT = 0.01  # of the camera's errors, for their weak prior and convergence
@@ -470,9 +469,8 @@ def _pairwise_measurements(
     At = np.swapaxes(A, 1, 2)
     H = H[:count] + At @ H[count:] @ A
     g = g[:count] + (At @ g[count:, :, None])[..., 0]
-    scaled = H * np.outer(projective.UNITS, projective.UNITS) + WEAK * np.eye(6)
-    step = -np.linalg.solve(scaled, (g * projective.UNITS)[..., None])[..., 0] * projective.UNITS
-    return T_i_j @ se3.exp(step), scaled / np.outer(projective.UNITS, projective.UNITS)
+    step, information = projective.step_with_weak_prior(H, g)
+    return T_i_j @ se3.exp(step), information
 
 
 def _system(
@@ -519,7 +517,7 @@ def _solve(
         H[:, 6:, 6:].sum(0),
         g[:, 6:].sum(0),
     )
-    damping = WEAK / _ERROR_UNIT**2 + DAMPING * shared.H.diagonal()
+    damping = projective.WEAK / _ERROR_UNIT**2 + DAMPING * shared.H.diagonal()
     if priors.gravity is not None:
         damping = np.append(damping, np.zeros(2))
         _add_gravity(poses, priors.gravity, unary, shared, system)
