@@ -68,114 +68,74 @@ class InTurn(Bounded, Registrar):
         return registration
 
 
-def _surface_icp(
-    resolution: float,
-    points: int | None,
-    reach: float,
-    max_iterations: int,
-    metric: interfaces.Metric,
-) -> Icp:
-    return Icp(
-        resolution,
-        source=icp_parts.at_most(points),
-        target=icp_parts.All(),
-        rejectors=(icp_parts.MaxDistance(reach),),
-        metric=metric,
-        stopping=icp_parts.SmallStep(max_iterations=max_iterations),
-    )
+@dataclass(frozen=True)
+class _SurfaceIcp(Variant):
+    """ICP with closest points, and a metric of surfaces.
+
+    Attributes
+    ----------
+    resolution
+        Typical distance between neighbouring points, m.
+    points
+        Random points of the source (None: all), against all of the target.
+    reach
+        Largest distance of a pair, in resolutions.
+    max_iterations
+        Maximum number of iterations.
+    """
+
+    resolution: float = 0.01
+    points: int | None = 1000
+    reach: float = 5.0
+    max_iterations: int = 50
+
+    def _with_metric(self, metric: interfaces.Metric) -> Icp:
+        return Icp(
+            self.resolution,
+            source=icp_parts.at_most(self.points),
+            target=icp_parts.All(),
+            rejectors=(icp_parts.MaxDistance(self.reach),),
+            metric=metric,
+            stopping=icp_parts.SmallStep(max_iterations=self.max_iterations),
+        )
 
 
 @part("registration", "point-to-plane", label="validated")
 @dataclass(frozen=True)
-class PointToPlaneIcp(Variant):
-    """Point-to-plane ICP (Chen and Medioni 1992) with closest points.
-
-    Attributes
-    ----------
-    resolution
-        Typical distance between neighbouring points, m.
-    points
-        Random points of the source (None: all), against all of the target.
-    reach
-        Largest distance of a pair, in resolutions.
-    max_iterations
-        Maximum number of iterations.
-    """
-
-    resolution: float = 0.01
-    points: int | None = 1000
-    reach: float = 5.0
-    max_iterations: int = 50
+class PointToPlaneIcp(_SurfaceIcp):
+    """Point-to-plane ICP (Chen and Medioni 1992) with closest points."""
 
     def parts(self) -> Icp:
         """See `Variant.parts`."""
-        return _surface_icp(
-            self.resolution,
-            self.points,
-            self.reach,
-            self.max_iterations,
-            surface_metrics.PointToPlane(),
-        )
+        return self._with_metric(surface_metrics.PointToPlane())
 
 
 @part("registration", "symmetric", label="validated")
 @dataclass(frozen=True)
-class SymmetricIcp(Variant):
-    """ICP with the symmetric objective (Rusinkiewicz 2019) and closest points.
-
-    Attributes
-    ----------
-    resolution
-        Typical distance between neighbouring points, m.
-    points
-        Random points of the source (None: all), against all of the target.
-    reach
-        Largest distance of a pair, in resolutions.
-    max_iterations
-        Maximum number of iterations.
-    """
-
-    resolution: float = 0.01
-    points: int | None = 1000
-    reach: float = 5.0
-    max_iterations: int = 50
+class SymmetricIcp(_SurfaceIcp):
+    """ICP with the symmetric objective (Rusinkiewicz 2019) and closest points."""
 
     def parts(self) -> Icp:
         """See `Variant.parts`."""
-        return _surface_icp(
-            self.resolution, self.points, self.reach, self.max_iterations, Symmetric()
-        )
+        return self._with_metric(Symmetric())
 
 
 @part("registration", "gicp", label="validated")
 @dataclass(frozen=True)
-class GeneralizedIcp(Variant):
+class GeneralizedIcp(_SurfaceIcp):
     """Generalised ICP, plane to plane (Segal, Haehnel and Thrun 2009).
 
     Attributes
     ----------
-    resolution
-        Typical distance between neighbouring points, m.
-    points
-        Random points of the source (None: all), against all of the target.
-    reach
-        Largest distance of a pair, in resolutions.
-    max_iterations
-        Maximum number of iterations.
     epsilon
         Variance across a surface relative to that along it.
     """
 
-    resolution: float = 0.01
-    points: int | None = 1000
-    reach: float = 5.0
-    max_iterations: int = 50
     epsilon: float = 1e-3
 
     def parts(self) -> Icp:
         """See `Variant.parts`."""
-        metric = surface_metrics.PlaneToPlane(self.epsilon)
-        return _surface_icp(self.resolution, self.points, self.reach, self.max_iterations, metric)
+        return self._with_metric(surface_metrics.PlaneToPlane(self.epsilon))
 
 
 @part("registration", "tricp", label="validated")
