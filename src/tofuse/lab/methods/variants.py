@@ -69,8 +69,8 @@ class InTurn(Bounded, Registrar):
 
 
 @dataclass(frozen=True)
-class _SurfaceIcp(Variant):
-    """ICP with closest points, and a metric of surfaces.
+class _ClosestPoints(Variant):
+    """ICP with closest points, and any metric.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class _SurfaceIcp(Variant):
 
 @part("registration", "point-to-plane", label="validated")
 @dataclass(frozen=True)
-class PointToPlaneIcp(_SurfaceIcp):
+class PointToPlaneIcp(_ClosestPoints):
     """Point-to-plane ICP (Chen and Medioni 1992) with closest points."""
 
     def parts(self) -> Icp:
@@ -112,7 +112,7 @@ class PointToPlaneIcp(_SurfaceIcp):
 
 @part("registration", "symmetric", label="validated")
 @dataclass(frozen=True)
-class SymmetricIcp(_SurfaceIcp):
+class SymmetricIcp(_ClosestPoints):
     """ICP with the symmetric objective (Rusinkiewicz 2019) and closest points."""
 
     def parts(self) -> Icp:
@@ -122,7 +122,7 @@ class SymmetricIcp(_SurfaceIcp):
 
 @part("registration", "gicp", label="validated")
 @dataclass(frozen=True)
-class GeneralizedIcp(_SurfaceIcp):
+class GeneralizedIcp(_ClosestPoints):
     """Generalised ICP, plane to plane (Segal, Haehnel and Thrun 2009).
 
     Attributes
@@ -223,7 +223,7 @@ class Tricp(Bounded, Registrar):
 
 @part("registration", "iccp", label="validated")
 @dataclass(frozen=True)
-class Iccp(Variant):
+class Iccp(_ClosestPoints):
     """Iterative Closest Compatible Point (Godin, Rioux and Baribeau 1994).
 
     Only points of similar amplitude are paired, so that texture constrains what the shape does not.
@@ -231,40 +231,23 @@ class Iccp(Variant):
 
     Attributes
     ----------
-    resolution
-        Typical distance between neighbouring points, m.
-    points
-        Random points of the source (None: all), against all of the target.
     ratio
         Largest ratio of two compatible amplitudes.
-    reach
-        Largest distance of a pair, in resolutions.
-    max_iterations
-        Maximum number of iterations.
     """
 
-    resolution: float = 0.01
-    points: int | None = 1000
-    ratio: float = 1.2
     reach: float = 10.0
     max_iterations: int = 100
+    ratio: float = 1.2
 
     def parts(self) -> Icp:
         """See `Variant.parts`."""
-        return Icp(
-            self.resolution,
-            source=icp_parts.at_most(self.points),
-            target=icp_parts.All(),
-            matcher=ClosestCompatible(self.ratio),
-            rejectors=(icp_parts.MaxDistance(self.reach),),
-            metric=icp_parts.PointToPoint(),
-            stopping=icp_parts.SmallStep(max_iterations=self.max_iterations),
-        )
+        plain = self._with_metric(icp_parts.PointToPoint())
+        return replace(plain, matcher=ClosestCompatible(self.ratio))
 
 
 @part("registration", "icpif", label="validated")
 @dataclass(frozen=True)
-class Icpif(Variant):
+class Icpif(_ClosestPoints):
     """ICP using invariant features (Sharp, Lee and Wehe 2002).
 
     Points are paired by their distance in space and in pose-invariant features, which enlarges the
@@ -272,10 +255,6 @@ class Icpif(Variant):
 
     Attributes
     ----------
-    resolution
-        Typical distance between neighbouring points, m.
-    points
-        Random points of the source (None: all), against all of the target.
     features
         Any of "curvature", "moments".
     weight
@@ -288,23 +267,14 @@ class Icpif(Variant):
         Of each of the two.
     """
 
-    resolution: float = 0.01
-    points: int | None = 1000
+    reach: float = 3.0
+    max_iterations: int = 100
     features: tuple[Invariant, ...] = ("moments",)
     weight: float = 20.0
     radius: float = 6.0
-    reach: float = 3.0
-    max_iterations: int = 100
 
     def parts(self) -> InTurn:
         """See `Variant.parts`."""
-        plain = Icp(
-            self.resolution,
-            source=icp_parts.at_most(self.points),
-            target=icp_parts.All(),
-            rejectors=(icp_parts.MaxDistance(self.reach),),
-            metric=icp_parts.PointToPoint(),
-            stopping=icp_parts.SmallStep(max_iterations=self.max_iterations),
-        )
+        plain = self._with_metric(icp_parts.PointToPoint())
         matcher = ClosestInvariant(self.features, self.weight, self.radius)
         return InTurn((replace(plain, matcher=matcher, rejectors=(icp_parts.Unique(),)), plain))
