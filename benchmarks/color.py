@@ -1,7 +1,7 @@
 """What colour at full resolution gives: simulated phones with and without it, and recordings.
 
     python benchmarks/color.py simulated [--scenes floor plain room] [--seeds 2]
-    python benchmarks/color.py shutter
+    python benchmarks/color.py shutter [--scenes floor room] [--seeds 2]
     python benchmarks/color.py recorded [--names ...]
 
 `simulated`: poses against truth, with colour images of 960x720 pixels beside smooth, lagging depth
@@ -15,7 +15,6 @@ selected by motion. In the same table, the errors against the reference where th
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import combinations, product
@@ -25,8 +24,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-import sequences
-from phone import features_of, opened
+from phone import features_of, matched_rays, opened, parsed, present
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import scaled
 from tofuse.engine.frames.recording import POSES_BY, Recording
@@ -37,7 +35,6 @@ from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.refinement import Joint
 from tofuse.engine.results import Reconstruction
-from tofuse.formats.recordings.open import open_recording
 from tofuse.lab import scenes
 from tofuse.lab.simulation.phone import COLOR, PhoneErrors, PhonePlan
 from tofuse.lab.world import Material, mesh, paths
@@ -137,19 +134,10 @@ def print_simulated(names: list[str], seeds: int, **options: Any) -> None:
 def epipolar_matches(recording: Recording) -> list[tuple[int, int, Float64, Float64, float]]:
     """Return positions i, j, rays (N, 2) in both images and the focal length of matched pairs."""
     out = []
-    matcher = cv2.BFMatcher()
     for a, b in combinations(list(features_of(recording)), 2):
-        back = {
-            m.queryIdx: m.trainIdx for (m,) in matcher.knnMatch(b.descriptors, a.descriptors, 1)
-        }
-        good = [
-            m
-            for m, second in matcher.knnMatch(a.descriptors, b.descriptors, 2)
-            if m.distance < 0.8 * second.distance and back[m.trainIdx] == m.queryIdx
-        ]
-        if len(good) < MIN_MATCHES:
+        x_a, x_b = matched_rays(a, b)
+        if len(x_a) < MIN_MATCHES:
             continue
-        x_a, x_b = a.rays[[m.queryIdx for m in good]], b.rays[[m.trainIdx for m in good]]
         _, mask = cv2.findEssentialMat(
             x_a, x_b, np.eye(3), method=cv2.USAC_MAGSAC, prob=0.9999,
             threshold=MATCH_PIXELS / a.focal,
@@ -174,11 +162,7 @@ def print_recorded(data: Path, names: list[str]) -> None:
     print("| recording | poses | epipolar distance, median (90 %), px | pairs | "
           "to reference, mm | deg | stated, mm | CPU of colour |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|")
-    for name in names:
-        if not (data / name).is_dir():
-            print(f"| {name} | missing | | | | | | |")
-            continue
-        recording = open_recording(data / name)
+    for name, recording in present(data, names, columns=8):
         matches = epipolar_matches(recording)
         prior: Prior = "auto" if POSES_BY in recording.metadata else "none"
         for method, result in both(recording, prior):
@@ -205,23 +189,14 @@ def print_recorded(data: Path, names: list[str]) -> None:
 
 def main() -> None:
     """Run the chosen part."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    commands = parser.add_subparsers(dest="command", required=True)
-    made = commands.add_parser("simulated")
-    made.add_argument("--scenes", nargs="+", default=["floor", "plain", "room"])
-    made.add_argument("--seeds", type=int, default=2)
-    rolling = commands.add_parser("shutter")
-    rolling.add_argument("--seeds", type=int, default=2)
-    real = commands.add_parser("recorded")
-    real.add_argument("--data", type=Path, default=sequences.DATA)
-    real.add_argument("--names", nargs="+", default=list(NAMES))
-    options = parser.parse_args()
+    shown = {"simulated": ["floor", "plain", "room"], "shutter": ["floor", "room"]}
+    options = parsed(__doc__, NAMES, shown)
     if options.command == "simulated":
         print_simulated(options.scenes, options.seeds)
     elif options.command == "shutter":
         for readout_s in (READOUT_S, 0.0):
             print(f"\nRead in {1000 * readout_s:.0f} ms\n")
-            print_simulated(["floor", "room"], options.seeds, readout_s=readout_s, speed=2.0)
+            print_simulated(options.scenes, options.seeds, readout_s=readout_s, speed=2.0)
     else:
         print_recorded(options.data, options.names)
 

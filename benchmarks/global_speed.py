@@ -19,13 +19,13 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 import sequences
+from scaling import forth_and_back
 from tofuse.engine.compute.thread_pool import run_chunks, threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion.options import Fusion
@@ -39,18 +39,11 @@ from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 
 
-def there_and_back(frames: list[RangeFrame], count: int) -> Iterator[RangeFrame]:
-    """`count` frames: the sequence forwards, backwards, and so on."""
-    order = [*range(len(frames)), *range(len(frames) - 2, 0, -1)]
-    for k in range(count):
-        yield replace(frames[order[k % len(order)]], index=k, timestamp=k / 30)
-
-
 def mapped(frames: list[RangeFrame], count: int) -> Reconstruction:
     """Run the default method with a minimal model: coarse voxels, no filters."""
     config = replace(from_method("default"), model_filters=(), fusion=Fusion(voxel_m=0.1))
     mapper = Mapper(config)
-    for frame in there_and_back(frames, count):
+    for frame in forth_and_back(frames, count):
         mapper.push(frame)
     return mapper.finish()
 
@@ -62,7 +55,7 @@ def pairs(frames: list[RangeFrame], result: Reconstruction, max_pairs: int) -> s
     loops = Revisits().start(0, (), store, spacing=closer)
     poses = result.diagnostics.sequential
     options = Keyframes().views.surface
-    for k, frame in enumerate(there_and_back(frames, len(frames))):
+    for k, frame in enumerate(forth_and_back(frames, len(frames))):
         if result.has_pose[k]:
             surface = prepare_view(frame, options).subsampled(200)
             store.push(surface, poses[k])

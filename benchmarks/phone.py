@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import combinations, product
@@ -101,6 +101,18 @@ def features_of(recording: Recording) -> Iterator[Features]:
         yield Features(k, rays, np.sqrt(found / found.sum(1, keepdims=True)), lens.fx)
 
 
+def matched_rays(a: Features, b: Features) -> tuple[Float64, Float64]:
+    """Return the rays (M, 2) in both images of features that are each other's best match."""
+    matcher = cv2.BFMatcher()
+    back = {m.queryIdx: m.trainIdx for (m,) in matcher.knnMatch(b.descriptors, a.descriptors, 1)}
+    matches = [
+        m
+        for m, second in matcher.knnMatch(a.descriptors, b.descriptors, 2)
+        if m.distance < RATIO * second.distance and back[m.trainIdx] == m.queryIdx
+    ]
+    return a.rays[[m.queryIdx for m in matches]], b.rays[[m.trainIdx for m in matches]]
+
+
 def color_rotations(recording: Recording) -> list[tuple[int, int, Float64]]:
     """Return positions i, j and the rotation R_i_j by the colour images alone."""
     out = []
@@ -113,17 +125,9 @@ def color_rotations(recording: Recording) -> list[tuple[int, int, Float64]]:
 
 def rotation_between(a: Features, b: Features) -> Float64 | None:
     """Return R_a_b by the matches of two images; None if there is no unique solution."""
-    matcher = cv2.BFMatcher()
-    back = {m.queryIdx: m.trainIdx for (m,) in matcher.knnMatch(b.descriptors, a.descriptors, 1)}
-    matches = [
-        m
-        for m, second in matcher.knnMatch(a.descriptors, b.descriptors, 2)
-        if m.distance < RATIO * second.distance and back[m.trainIdx] == m.queryIdx
-    ]
-    if len(matches) < MIN_MATCHES:
+    x_a, x_b = matched_rays(a, b)
+    if len(x_a) < MIN_MATCHES:
         return None
-    x_a = a.rays[[m.queryIdx for m in matches]]
-    x_b = b.rays[[m.trainIdx for m in matches]]
     rng = np.random.default_rng(0)
     found = [_fit(x_a, x_b, rng.permutation(len(x_a))[::2], a.focal) for _ in range(STARTS)]
     solutions = sorted((s for s in found if s is not None), key=lambda s: s.cost)
@@ -201,15 +205,20 @@ def methods(recording: Recording) -> Iterator[tuple[str, Float64, float]]:
         yield name, result.trajectory, result.diagnostics.accuracy.position_m
 
 
+def present(data: Path, names: list[str], columns: int) -> Iterator[tuple[str, Recording]]:
+    """Yield the recordings that are in a folder; the others get a row of the table each."""
+    for name in names:
+        if (data / name).is_dir():
+            yield name, open_recording(data / name)
+        else:
+            print(f"| {name} | missing |" + (columns - 2) * " |")
+
+
 def recorded(data: Path, names: list[str]) -> None:
     """Print the table of real phones."""
     print("| recording | poses | rotation, median (90 %), deg | pairs | map rms, mm | inliers |")
     print("|---|---|---|---|---|---|")
-    for name in names:
-        if not (data / name).is_dir():
-            print(f"| {name} | missing | | | | |")
-            continue
-        recording = open_recording(data / name)
+    for name, recording in present(data, names, columns=6):
         measured = color_rotations(recording)
         for method, poses, _ in methods(recording):
             angles = np.degrees(rotation_errors(poses, measured))
@@ -288,19 +297,40 @@ def surfaces(scenes: list[str], seeds: int, frames: int) -> None:
             )
 
 
-def main() -> None:
-    """Run the chosen part."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+def parsed(
+    text: str, names: Sequence[str], simulated: Mapping[str, list[str]], frames: int | None = None
+) -> argparse.Namespace:
+    """Return the options of a script that looks at real or at simulated recordings.
+
+    Parameters
+    ----------
+    text
+        What the script does, in its first line.
+    names
+        Default of `--names` of the command `recorded`.
+    simulated
+        Defaults of `--scenes` of the other commands.
+    frames
+        Default of their `--frames`, if they have that.
+    """
+    parser = argparse.ArgumentParser(description=text.split("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
     real = commands.add_parser("recorded")
     real.add_argument("--data", type=Path, default=sequences.DATA)
-    real.add_argument("--names", nargs="+", default=list(PHONES))
-    for name, scenes in (("simulated", ["room", "rail"]), ("surface", ["room", "flat"])):
+    real.add_argument("--names", nargs="+", default=list(names))
+    for name, scenes in simulated.items():
         made = commands.add_parser(name)
         made.add_argument("--scenes", nargs="+", default=scenes)
         made.add_argument("--seeds", type=int, default=2)
-        made.add_argument("--frames", type=int, default=64)
-    options = parser.parse_args()
+        if frames is not None:
+            made.add_argument("--frames", type=int, default=frames)
+    return parser.parse_args()
+
+
+def main() -> None:
+    """Run the chosen part."""
+    scenes = {"simulated": ["room", "rail"], "surface": ["room", "flat"]}
+    options = parsed(__doc__, PHONES, scenes, frames=64)
     if options.command == "recorded":
         recorded(options.data, options.names)
     elif options.command == "surface":

@@ -33,6 +33,7 @@ from tofuse.engine.graph.certificate import certify
 from tofuse.engine.graph.graph import Optimiser, PoseGraph
 from tofuse.engine.graph.levenberg import LevenbergMarquardt, minimise
 from tofuse.engine.graph.robust import Settings
+from tofuse.engine.graph.sparse import equations
 from tofuse.engine.quality.trajectory_errors import align
 from tofuse.formats.poses.g2o import read_g2o, write_g2o
 from tofuse.lab.methods.charts import Cosines, Quaternion, descend
@@ -234,9 +235,7 @@ def general_solver(graph: PoseGraph) -> list[float]:
     def value(x: Float64) -> tuple[float, Float64]:
         T = poses_of(x)
         here = graph.with_poses(T)
-        e = here.residuals()
-        J = se3.jacobian_inverse(e)
-        pull = 2 * np.swapaxes(J, 1, 2) @ (graph.information @ e[..., None])
+        pull = 2 * equations(here.residuals(), graph.information)[1][..., None]
         A = se3.adjoint(se3.inverse(T[j]) @ T[i])
         g = np.zeros((len(T), 6))
         np.add.at(g, j, pull[..., 0])

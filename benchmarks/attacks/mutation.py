@@ -233,7 +233,7 @@ def _small() -> dict[str, Subject]:
     from tofuse.engine.mapping.methods import from_method
     from tofuse.engine.noise.model import NoiseModel, RangeLaw
     from tofuse.engine.results.types import FrameRecord
-    from tofuse.engine.tracking.base import Step
+    from tofuse.engine.tracking.base import Step, Tracker
     from tofuse.formats.cameras.calibration_files import read_noise
     from tofuse.formats.cameras.camera_file import read_camera_file
     from tofuse.formats.files.tables import read_columns
@@ -267,17 +267,16 @@ def _small() -> dict[str, Subject]:
     def configure(path: Path) -> None:
         changed(from_method("default"), read_changes(path), where=str(path))
 
-    def replay(path: Path) -> TrackedFile:
+    def replay(path: Path) -> tuple[TrackedFile, Tracker]:
         file = TrackedFile(path, "key", lambda _note: None)
-        file.tracker(from_method("default").odometry.start(0))
-        return file
+        return file, file.tracker(from_method("default").odometry.start(0))
 
     def track(path: Path) -> None:
-        file, log = replay(path), FrameLog()
+        (file, tracker), log = replay(path), FrameLog()
         for k in range(3):
             log.add(FrameRecord(k, 0.1 * k, "tracked"), Step("tracked", "", np.eye(4)))
         tracked_file._MIN_TRACKING_S = 0.0
-        file.finish(log)
+        file.finish(tracker, log)
 
     texts: dict[str, tuple[str, str, Callable[[Path], object]]] = {
         "g2o": ("a.g2o", "\n".join([*vertices, *edges]) + "\n", read_g2o),

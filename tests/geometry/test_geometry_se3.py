@@ -177,32 +177,3 @@ def test_from_matrix_inverts_to_matrix(q: np.ndarray) -> None:
 def test_quaternion_product_matches_matrix_product(a: np.ndarray, b: np.ndarray) -> None:
     A, B = quaternion.to_matrix(a), quaternion.to_matrix(b)
     np.testing.assert_allclose(quaternion.to_matrix(quaternion.multiply(a, b)), A @ B, atol=1e-12)
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-5, 0.03, 0.0999, 0.1001, 1.0, 3.1])
-def test_jacobian_matches_series(angle):
-    """sum (-ad)^n / (n + 1)!, which converges for every twist; and the two are inverse."""
-    rng = np.random.default_rng(11)
-    xi = rng.normal(size=6)
-    xi[3:] *= angle / np.linalg.norm(xi[3:])
-    ad = np.zeros((6, 6))
-    ad[:3, :3] = ad[3:, 3:] = se3.hat(xi[3:])
-    ad[:3, 3:] = se3.hat(xi[:3])
-    series, term = np.zeros((6, 6)), np.eye(6)
-    for n in range(60):
-        series += term
-        term = term @ -ad / (n + 2)
-    np.testing.assert_allclose(se3.jacobian(xi), series, atol=1e-13)
-    np.testing.assert_allclose(se3.jacobian_inverse(xi) @ series, np.eye(6), atol=1e-13)
-
-
-def test_inverse_jacobian_is_derivative_of_log():
-    rng = np.random.default_rng(12)
-    xi = rng.normal(size=(5, 6))
-    numeric = np.zeros((5, 6, 6))
-    for axis in range(6):
-        d = np.zeros(6)
-        d[axis] = 1e-6
-        up, down = (se3.log(se3.exp(xi) @ se3.exp(sign * d)) for sign in (1, -1))
-        numeric[..., axis] = (up - down) / 2e-6
-    np.testing.assert_allclose(se3.jacobian_inverse(xi), numeric, atol=1e-8)

@@ -85,7 +85,7 @@ def test_reconstruction_is_repeated_exactly(tmp_path: Path, monkeypatch) -> None
     kept: list[FrameLog] = []
     finish = TrackedFile.finish
     monkeypatch.setattr(
-        TrackedFile, "finish", lambda self, log: kept.append(log) or finish(self, log)
+        TrackedFile, "finish", lambda self, t, log: kept.append(log) or finish(self, t, log)
     )
     trackers: list[Tracker] = []
     start = TrackedFile.tracker
@@ -212,7 +212,7 @@ def stored(path: Path, notes: list[str], count: int = 3) -> TrackedFile:
     for k in range(count):
         frame = seen(np.eye(4), k)
         log.add(FrameRecord(k, 0.1 * k, "tracked"), tracker.push(frame))
-    file.finish(log)
+    file.finish(tracker, log)
     return file
 
 

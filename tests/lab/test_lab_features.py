@@ -9,7 +9,7 @@ import pytest
 
 import tofuse
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.clouds.robust_motion import ConsensusOptions, Pairs, motion_of
+from tofuse.engine.clouds.robust_motion import ConsensusOptions, Pairs, motions_of
 from tofuse.engine.clouds.robust_motion import consensus as consensus_of
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import RangeFrame
@@ -115,6 +115,11 @@ def test_one_inlier_in_fifty_pairs_is_enough(seed):
     shift, turn = off(found[0].T_target_source, T)
     assert shift < 0.06
     assert turn < 2
+
+
+def motion_of(pairs):
+    """Least squares motion of all pairs, weighted by their inverse variances."""
+    return motions_of(pairs.source[None], pairs.target[None], 1 / pairs.variance[None])[0]
 
 
 @pytest.mark.parametrize("method", METHODS)

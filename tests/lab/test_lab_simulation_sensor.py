@@ -371,7 +371,7 @@ def test_factory_correction_leaves_less_than_1_mm(name: str) -> None:
 
 
 def test_rendering_is_independent_of_threads_and_other_frames() -> None:
-    scene, sequence = build("corner", frames=4)
+    scene, sequence = build("corner")
     model = replace(camera_model("sr4000"), camera=MODEL.camera)
 
     def take(index: int, seed: int = 0) -> tuple[bytes, ...]:

@@ -95,7 +95,7 @@ def test_messages_find_minimum_of_a_chain() -> None:
         valid = np.ones((1, n), bool)
         messages = np.zeros((4, 1, n, labels), np.float32)
         for step in range(2 * n):
-            pass_messages(range_m, valid, unary, PERIOD, 0.5, 3.0, 1.0, 0, 1, step % 2, messages)
+            pass_messages(range_m, valid, unary, PERIOD, 0.5, 3.0, 0, 1, step % 2, messages)
         found = np.argmin(unary + messages.sum(0), axis=2)[0]
         states = np.stack(np.meshgrid(*[range(labels)] * n, indexing="ij"), -1).reshape(-1, n)
         cost = unary[0, np.arange(n), states].sum(1)

@@ -117,7 +117,6 @@ def test_static_room_has_no_moving_objects(room):
     for _, predicted, moving in found:
         assert moving.reliable
         assert moving.fraction == 0
-        assert moving.segments == 0
         assert not moving.view.any()
         assert not moving.reference.any()
         assert not predicted.any()

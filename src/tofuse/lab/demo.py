@@ -174,32 +174,22 @@ def simulate_to(
         progress.advance()
 
     created = not out.exists() or (out.is_dir() and not any(out.iterdir()))
-    noise: dict[str, Any] = {} if sigma is None else {"sigma_m": sigma}
-    selection: dict[str, Any] = {"every": every, "frames": frames, "first": first}
+    options: dict[str, Any] = {
+        "seed": seed, "every": every, "frames": frames, "first": first, "texture": texture
+    }  # fmt: skip
+    of_sensor = {"passing": passing, "mirror": mirror, "imu": imu}
     try:
         if camera == phone.NAME:
-            _refuse(passing=passing, mirror=mirror, imu=imu, no_correction=not correction)
+            _refuse(**of_sensor, no_correction=not correction)
             errors = phone.PhoneErrors().without(*without)
-            planned = phone.plan_phone(
-                scene, seed=seed, errors=errors, texture=texture, **selection
-            )
-            phone.write_phone(planned, out, report)
+            phone.write_phone(phone.plan_phone(scene, errors=errors, **options), out, report)
         else:
+            options |= of_sensor | ({} if sigma is None else {"sigma_m": sigma})
+            effects = Effects().without(*without)
             simulate(
-                scene,
-                out,
-                camera=camera,
-                seed=seed,
-                effects=Effects().without(*without),
-                passing=passing,
-                mirror=mirror,
-                correction=correction,
-                texture=texture,
-                imu=imu,
-                progress=report,
-                **selection,
-                **noise,
-            )
+                scene, out, camera=camera, effects=effects, correction=correction,
+                progress=report, **options,
+            )  # fmt: skip
     except BaseException:
         if created:
             shutil.rmtree(out, ignore_errors=True)

@@ -16,14 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tofuse.apps.cli import options as cli
-from tofuse.apps.cli.progress import (
-    JsonProgress,
-    QuietProgress,
-    TerminalProgress,
-    emit,
-    escaped,
-    progress_for,
-)
+from tofuse.apps.cli.progress import emit, escaped, progress_for
 from tofuse.engine.errors import InputError
 from tofuse.engine.results import Reason, Reconstruction
 from tofuse.engine.stopwatch import timing
@@ -35,6 +28,7 @@ if TYPE_CHECKING:
     from tofuse.apps.viewer import LiveMap, ReportServer
     from tofuse.engine.arrays import Bool
     from tofuse.engine.graph import Optimisation, PoseGraph, certificate
+    from tofuse.engine.progress import Progress
 
 _Options = TypeVar("_Options", bound="DataclassInstance")
 
@@ -87,11 +81,11 @@ def warning_lines(warnings: Iterable[str]) -> list[str]:
     return [f"[yellow]warning:[/] {escaped(warning)}" for warning in warnings]
 
 
-def progress_unless_json(
-    arguments: cli.Json,
-) -> AbstractContextManager[TerminalProgress | JsonProgress | QuietProgress | None]:
+def progress_unless_json(arguments: cli.Json) -> AbstractContextManager[Progress]:
     """The progress of a command whose --json prints a single object."""
-    return nullcontext() if arguments.json else progress_for(as_json=False)
+    from tofuse.engine.progress import Silent
+
+    return nullcontext(Silent()) if arguments.json else progress_for(as_json=False)
 
 
 def run(arguments: cli.Run) -> int:

@@ -20,7 +20,7 @@ from tofuse.apps.compare.repeating import Repetition, loaded_sessions, repeated
 from tofuse.apps.results import folders
 from tofuse.engine.compute import threads
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.engine.progress import Progress, Silent
+from tofuse.engine.progress import Progress
 from tofuse.formats.files import atomic
 from tofuse.formats.geometry import write_ply
 from tofuse.formats.poses import read_pose
@@ -53,9 +53,8 @@ class RepeatOptions:
 
 
 def compare_files(
-    result: str, reference: str, options: CompareOptions | None = None,
-    progress: Progress | None = None,
-) -> Comparison:  # fmt: skip
+    result: str, reference: str, options: CompareOptions, progress: Progress
+) -> Comparison:
     """Compare two files or folders, and write the result; see `compare` for errors.
 
     Raises
@@ -63,7 +62,6 @@ def compare_files(
     OutputError
         If the result can't be written; existing files are then unchanged.
     """
-    options, progress = options or CompareOptions(), progress or Silent()
 
     def work() -> Comparison:
         progress.stage("comparing")
@@ -114,11 +112,8 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
     _write_json(comparison.to_dict(), folder / COMPARED)
 
 
-def repeat_files(
-    results: Sequence[Path], options: RepeatOptions | None = None, progress: Progress | None = None
-) -> Repetition:
+def repeat_files(results: Sequence[Path], options: RepeatOptions, progress: Progress) -> Repetition:
     """Compare results of the same place, and write what was found; see `repeated` for errors."""
-    options, progress = options or RepeatOptions(), progress or Silent()
 
     def work() -> Repetition:
         progress.stage("reading", len(results))

@@ -488,8 +488,8 @@ class JudgeOptions(OpeningOptions):
 def judge_files(
     inputs: Sequence[str | Path],
     trajectory: Path,
-    options: JudgeOptions | None = None,
-    progress: Progress | None = None,
+    options: JudgeOptions,
+    progress: Progress,
 ) -> Judgement:
     """Judge the poses in a file, and write the refined result if an output folder is given.
 
@@ -500,7 +500,6 @@ def judge_files(
     OutputError
         If the result can't be written; an existing folder is then unchanged.
     """
-    options, progress = options or JudgeOptions(), progress or Silent()
     opening = Opening.of(inputs, options)
     recording = opening.open()
     out = options.out

@@ -28,7 +28,7 @@ from tofuse.engine.frames import Frame, RangeFrame, Recording, evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import locating
 from tofuse.engine.mapping import Config, adaptation, clips, from_method, kind_of
-from tofuse.engine.progress import Progress, Silent
+from tofuse.engine.progress import Progress
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.search import pose_probability
 from tofuse.engine.stored_views import PosedView
@@ -252,7 +252,7 @@ class LocateOptions(OpeningOptions):
 
 
 def locate_files(
-    result: Path, name: str, options: LocateOptions | None = None, progress: Progress | None = None
+    result: Path, name: str, options: LocateOptions, progress: Progress
 ) -> list[LocatedFrame]:
     """Locate a frame (REC#12), a clip or a cloud in a result, and write the poses.
 
@@ -263,7 +263,6 @@ def locate_files(
     OutputError
         If the poses can't be written; existing files are then unchanged.
     """
-    options, progress = options or LocateOptions(), progress or Silent()
     with threads(options.threads), threadpool_limits(1):
         progress.stage("opening")
         if options.out is None:

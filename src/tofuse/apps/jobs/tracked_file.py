@@ -52,8 +52,6 @@ class TrackedFile:
 
     def __init__(self, path: Path, key: str, note: Callable[[str], None]) -> None:
         self._path, self._key, self._note = path, key, note
-        self._tracker: LoggingTracker | ReplayingTracker
-        self._start_s = 0.0
 
     def tracker(self, tracker: Tracker) -> Tracker:
         """Return a tracker that repeats the stored steps, or else one that tracks.
@@ -63,30 +61,25 @@ class TrackedFile:
         tracker
             Prepares views, and tracks.
         """
-        self._start_s = perf_counter()
-        self._tracker = self._replaying(tracker) or LoggingTracker(tracker)
-        return self._tracker
+        return self._replaying(tracker) or LoggingTracker(tracker)
 
     @timing("writing")
-    def finish(self, log: FrameLog) -> None:
-        """Store the steps of all frames after tracking, and release the tracker.
+    def finish(self, tracker: Tracker, log: FrameLog) -> None:
+        """Store the steps of all frames after tracking, with what the tracker has kept.
 
         Raises
         ------
         InputError
             If steps were repeated, and not those of all frames.
         """
-        indices = [e.record.index for e in log.entries if e.step is not None]
-        tracker = self._tracker
-        del self._tracker  # its keyframes, which would stay in memory during all later stages
         if isinstance(tracker, ReplayingTracker):
-            if indices != tracker.indices:
+            if [e.record.index for e in log.entries if e.step is not None] != tracker.indices:
                 raise InputError(
                     "other frames can be read than before the interruption",
                     where=self._path,
                     remedy="run the same command again: it starts again from the beginning",
                 )
-        elif perf_counter() - self._start_s >= _MIN_TRACKING_S:
+        elif isinstance(tracker, LoggingTracker) and tracker.took_long:
             self._store(_packed(log, tracker))
 
     def keep_after(self, error: BaseException) -> None:
@@ -158,7 +151,12 @@ class LoggingTracker(Tracker):
     def __init__(self, tracker: Tracker) -> None:
         self.predicted: dict[int, Float64] = {}
         self.moving: dict[int, UInt8] = {}
-        self._tracker = tracker
+        self._tracker, self._start_s = tracker, perf_counter()
+
+    @property
+    def took_long(self) -> bool:
+        """Whether what has been tracked is worth a file."""
+        return perf_counter() - self._start_s >= _MIN_TRACKING_S
 
     def push(
         self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None

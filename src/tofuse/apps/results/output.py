@@ -163,11 +163,11 @@ def _write_scene(mesh: Mesh, T_up_world: Float64, folder: Path, texture: Texture
     write_glb(folder / "mesh.glb", textured_record(texture), **node)
 
 
-def display_record(mesh: Mesh, faces: int = DISPLAY_FACES) -> GeometryRecord:
+def display_record(mesh: Mesh) -> GeometryRecord:
     """Return a simplified surface with the colours of its vertices in a texture."""
     if mesh.color is None:
         mesh = replace(mesh, color=np.zeros_like(mesh.vertices, np.uint8))
-    return textured_record(texture.baked(mesh, faces, TEXTURE_SIZE))
+    return textured_record(texture.baked(mesh, DISPLAY_FACES, TEXTURE_SIZE))
 
 
 def textured_record(texture: Textured, jpeg: bytes | None = None) -> GeometryRecord:

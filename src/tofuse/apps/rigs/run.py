@@ -66,11 +66,7 @@ class RigResult:
 
 
 def run_rig(
-    rig_file: Path,
-    inputs: Sequence[str | Path],
-    options: Options,
-    *,
-    progress: Progress | None = None,
+    rig_file: Path, inputs: Sequence[str | Path], options: Options, *, progress: Progress
 ) -> RigResult:
     """Reconstruct the recordings of a rig's cameras, and write the output folder.
 
@@ -81,7 +77,6 @@ def run_rig(
     OutputError
         If the result can't be written.
     """
-    progress = progress or Silent()
     with using_threads(options.threads), threadpool_limits(1):
         progress.stage("opening")
         cameras = open_cameras(inputs, options.format, list(recordings_of(rig_file)))

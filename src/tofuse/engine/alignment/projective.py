@@ -24,6 +24,7 @@ from tofuse.engine.views import residual_kernels as kernels
 
 # A direction is constrained if its sigma is at most 1 cm, or 1 degree.
 UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
+WEAK = 1e-3  # information of a weak prior in `UNITS`
 # Below this depth, noise inflation is reduced in proportion to the depth.
 _NEAR_M = 1.0
 # With fewer points the noise scale, their median residual, has an error above 8 %.
@@ -32,6 +33,16 @@ _MIN_POINTS = 200
 _FEW_TARGETS = 4
 # Noise scales of one camera's views differ by less than this factor.
 _MAX_SCALE_RATIO = 3.0
+
+
+def step_with_weak_prior(H: Float64, g: Float64) -> tuple[Float64, Float64]:
+    """Return the steps (..., 6) of normal equations (..., 6, 6), (..., 6), and their information.
+
+    A weak prior, which is part of it, keeps what they do not constrain in place.
+    """
+    units = np.outer(UNITS, UNITS)
+    scaled = H * units + WEAK * np.eye(6)
+    return -np.linalg.solve(scaled, (g * UNITS)[..., None])[..., 0] * UNITS, scaled / units
 
 
 @dataclass(frozen=True)

@@ -165,15 +165,6 @@ def are_distinct(
     return (np.linalg.norm(shift, axis=1) > metres) | (angle > rad)
 
 
-def motion_of(pairs: Pairs) -> Float64:
-    """Return the weighted least squares motion (4, 4) (Arun et al. 1987, Umeyama 1991).
-
-    Weights are inverse variances.
-    """
-    weight = 1 / pairs.variance
-    return motions_of(pairs.source[None], pairs.target[None], weight[None])[0]
-
-
 def _compatible_motions(pairs: Pairs, options: ConsensusOptions) -> Float64:
     """Return the motions (k, 4, 4) of sets of pairwise compatible pairs."""
     if len(pairs) > _MAX_COMPATIBLE_PAIRS:
@@ -199,7 +190,10 @@ def _compatible_motions(pairs: Pairs, options: ConsensusOptions) -> Float64:
 
 
 def motions_of(p: Float64, q: Float64, weight: Float64) -> Float64:
-    """Return least squares motions (k, 4, 4) of k lists of n pairs (k, n, 3), weights (k, n)."""
+    """Return least squares motions (k, 4, 4) of k lists of n pairs (k, n, 3), weights (k, n).
+
+    After Arun et al. (1987) and Umeyama (1991).
+    """
     relative = (weight / weight.sum(1, keepdims=True))[..., None]
     p0, q0 = (relative * p).sum(1), (relative * q).sum(1)
     H = np.einsum("kni,knj->kij", relative * (p - p0[:, None]), q - q0[:, None])

@@ -32,7 +32,6 @@ _BETTER, _BY_CHANCE = 0.95, 1e-6
 # first beyond which matches are false.
 _MEDIAN_2, _MEDIAN_6, _LIMIT = 1.386, 5.348, 18.0
 _ITERATIONS, _CONVERGED = 30, 1e-2  # in `UNITS`
-_WEAK = 1e-3  # information of a weak prior in `UNITS`
 # Standard deviation of the times of a rolling shutter's rows, which usually takes up to 20 ms; the
 # times of colour and depth differ by no more.
 _SHUTTER_S = 0.006
@@ -92,7 +91,7 @@ def measured_pairs(
     if not len(pairs):
         return ()
     T, information = (np.stack(column) for column in zip(*filter(None, fits), strict=True))
-    C = np.linalg.inv(information + np.diag(_WEAK / projective.UNITS**2))
+    C = np.linalg.inv(information + np.diag(projective.WEAK / projective.UNITS**2))
     variance = (_SHUTTER_S * np.array([view.speed for view in views])) ** 2
     C *= _disagreement(pairs, T, C)
     shared = (np.swapaxes(T[:, :3, :3], 1, 2) @ T[:, :3, 3:])[..., 0] * _DEPTH_SCALE
@@ -182,8 +181,7 @@ def _fit(
         Jd, rd = np.einsum("nik,ni->nk", J, d), (r * d).sum(1)
         H = np.einsum("nik,n,nil->kl", J, weight, J) - np.einsum("nk,n,nl->kl", Jd, by_depth, Jd)
         g = np.einsum("nik,n,ni->k", J, weight, r) - Jd.T @ (by_depth * rd)
-        scaled = H * np.outer(projective.UNITS, projective.UNITS) + _WEAK * np.eye(6)
-        step = -np.linalg.solve(scaled, g * projective.UNITS) * projective.UNITS
+        step, _ = projective.step_with_weak_prior(H, g)
         T_i_j = se3.orthonormalise(T_i_j @ se3.exp(step))
         if np.abs(step / projective.UNITS).max() < _CONVERGED:
             return T_i_j, H

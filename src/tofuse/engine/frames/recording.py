@@ -250,7 +250,7 @@ class Recording:
         return (item for item, _ in self.read_with(lambda frame: None, ahead))
 
     def read_with(
-        self, process: Callable[[Frame], R], ahead: int = 8, *, first: int = 0
+        self, process: Callable[[Frame], R], ahead: int = 8
     ) -> Iterator[tuple[Frame | UnreadableFrameError, R | None]]:
         """Iterate as `read_all` does, with the result of a function of each frame.
 
@@ -261,8 +261,6 @@ class Recording:
             is None for frames that can't be read.
         ahead
             Maximum number of frames that are read in advance.
-        first
-            Position of the first frame.
         """
 
         def read(index: int) -> tuple[Frame | UnreadableFrameError, R | None]:
@@ -274,7 +272,7 @@ class Recording:
 
         workers = 2 if getattr(self.source, "concurrent", False) else 1
         pool = job_pool(workers, "tofuse-reader")
-        indices = iter(self.indices[first:].tolist())
+        indices = iter(self.indices.tolist())
         pending = deque(pool.submit(read, k) for k in islice(indices, max(1, ahead)))
         try:
             while pending:

@@ -108,60 +108,6 @@ def log(T: ArrayLike) -> Float64:
     return np.concatenate([t, w], axis=-1)
 
 
-def jacobian_inverse(xi: ArrayLike) -> Float64:
-    """Inverse right Jacobian J (..., 6, 6): ``log(exp(xi) exp(d)) = xi + J d + O(d^2)``.
-
-    In the (t, r) order, from the left one at ``-xi`` (Barfoot, eqs 7.86 and 7.95). Singular where
-    the rotation is a full turn.
-    """
-    xi = -np.asarray(xi, float)
-    J = left_jacobian_inverse(xi[..., 3:])
-    return _block_triangular(J, -J @ _coupling(xi) @ J)
-
-
-def jacobian(xi: ArrayLike) -> Float64:
-    """Right Jacobian J (..., 6, 6): ``exp(xi + d) = exp(xi) exp(J d + O(d^2))``."""
-    xi = -np.asarray(xi, float)
-    return _block_triangular(left_jacobian(xi[..., 3:]), _coupling(xi))
-
-
-def _block_triangular(diagonal: Float64, upper: Float64) -> Float64:
-    """Return (..., 6, 6) matrices with two equal blocks (..., 3, 3) on the diagonal, 0 below."""
-    out = np.zeros((*diagonal.shape[:-2], 6, 6))
-    out[..., :3, :3] = out[..., 3:, 3:] = diagonal
-    out[..., :3, 3:] = upper
-    return out
-
-
-def _coupling(xi: Float64) -> Float64:
-    """Block Q (..., 3, 3) of the left Jacobian, which couples rotation and translation."""
-    V, W = hat(xi[..., :3]), hat(xi[..., 3:])
-    angle = np.linalg.norm(xi[..., 3:], axis=-1)
-    _, s2, s3 = _coefficients(angle)
-    # The last two coefficients cancel to nothing at small angles, long before s2 and s3 do.
-    small = angle < 0.1
-    a = np.where(small, 1.0, angle)
-    a2 = angle * angle
-    c2 = np.where(
-        small,
-        1 / 24 - a2 / 720 + a2 * a2 / 40320 - a2**3 / 3628800,
-        (0.5 - s2) / (a * a),
-    )
-    c3 = np.where(
-        small,
-        1 / 120 - a2 / 2520 + a2 * a2 / 120960 - a2**3 / 9979200,
-        (c2 - 3 * (1 / 6 - s3) / (a * a)) / 2,
-    )
-    WV, VW = W @ V, V @ W
-    WVW = WV @ W
-    return (
-        0.5 * V
-        + s3[..., None, None] * (WV + VW + WVW)
-        + c2[..., None, None] * (W @ WV + VW @ W - 3 * WVW)
-        + c3[..., None, None] * (WVW @ W + W @ WVW)
-    )
-
-
 def inverse(T: ArrayLike) -> Float64:
     """Inverse of rigid motions (..., 4, 4): ``T_b_a`` from ``T_a_b``."""
     T = np.asarray(T, float)
@@ -177,7 +123,10 @@ def adjoint(T: ArrayLike) -> Float64:
     """Adjoint (..., 6, 6): ``T exp(xi) T^-1 == exp(adjoint(T) @ xi)`` in the (t, r) order."""
     T = np.asarray(T, float)
     R = T[..., :3, :3]
-    return _block_triangular(R, hat(T[..., :3, 3]) @ R)
+    out = np.zeros((*R.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R
+    out[..., :3, 3:] = hat(T[..., :3, 3]) @ R
+    return out
 
 
 def transform(T: ArrayLike, points: ArrayLike) -> Float64:

@@ -33,7 +33,7 @@ def normal_equations(
     ----------
     e, information, weights
         (M, 6) errors log(Z^-1 T_i_j), (M, 6, 6) information W and (M,) weights w of the edges. J is
-        the `se3.jacobian_inverse` of e.
+        the inverse right Jacobian of e: ``log(exp(e) exp(d)) = e + J d + O(d^2)``.
     H, g
         (M, 6, 6) and (M, 6), are overwritten.
     """
@@ -61,7 +61,11 @@ def normal_equations(
 
 @kernel
 def _jacobian_inverse(e: Float64, J: Float64, scratch: Float64) -> None:
-    """Write the inverse right Jacobian of a twist (6,) to J (6, 6), zero below its diagonal."""
+    """Write the inverse right Jacobian of a twist (6,) to J (6, 6), zero below its diagonal.
+
+    From the left one at the opposite twist (Barfoot, State Estimation for Robotics, eqs 7.86 and
+    7.95). Singular where the rotation is a full turn.
+    """
     V, W, VW, WV, WVW, left, coupling, product = scratch
     _hat(-e[0], -e[1], -e[2], V)
     _hat(-e[3], -e[4], -e[5], W)

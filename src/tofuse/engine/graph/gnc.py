@@ -39,7 +39,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.graph import robust
 from tofuse.engine.graph.minimisation import Descent, Problem
 from tofuse.engine.graph.robust import Settings
-from tofuse.engine.graph.sparse import PairSystem
+from tofuse.engine.graph.sparse import PairSystem, equations
 
 # Smallest information along a direction, relative to the largest of the edge: its inverse exists.
 _MIN_INFORMATION = 1e-12
@@ -293,12 +293,11 @@ class GraduatedNonConvexity:
         except RuntimeError:
             return None
         e = descent.e[self.loop]
-        J = se3.jacobian_inverse(e)
-        W = np.swapaxes(J, 1, 2) @ problem.information[self.loop] @ J
+        W, _ = equations(e, problem.information[self.loop])
         value, vector = np.linalg.eigh(W)
         root = vector * np.sqrt(np.maximum(value, 0))[:, None]  # W = root root^T
         Rt = np.swapaxes(root, 1, 2)
-        m = (Rt @ (se3.jacobian(e) @ e[..., None]))[..., 0]
+        m = (Rt @ e[..., None])[..., 0]  # a twist is the same in both tangent spaces
         # C includes an accepted loop, but not a rejected one.
         sign = np.where(self.weights[self.loop] > 0, -1.0, 1.0)
         scale, axes = np.linalg.eigh(np.eye(6) + sign[:, None, None] * (Rt @ C @ root))

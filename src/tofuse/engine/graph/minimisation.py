@@ -11,7 +11,7 @@ from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import edge_kernels, robust
 from tofuse.engine.graph.graph import ROUNDING, Gravity
-from tofuse.engine.graph.sparse import Factor, PairSystem
+from tofuse.engine.graph.sparse import Factor, PairSystem, equations
 
 _MAX_ANGLE = 3.0  # rad, of errors by the kernel
 
@@ -93,8 +93,7 @@ class Problem:
         self, poses: Float64, e: Float64, down: Float64, weights: Float64
     ) -> tuple[Any, Float64]:
         """Return the normal equations (matrix, gradient) at the poses of the given errors."""
-        H, g = np.empty((len(e), 6, 6)), np.empty((len(e), 6))
-        edge_kernels.normal_equations(e, self.information, weights, H, g)
+        H, g = equations(e, self.information, weights)
         i, j = self.all_pairs.T
         T_i_j = se3.inverse(poses[i]) @ poses[j]
         if self.gravity is not None:

@@ -23,6 +23,7 @@ from scipy.sparse.linalg import splu
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.compute import one_blas_thread
 from tofuse.engine.geometry import se3
+from tofuse.engine.graph import edge_kernels
 from tofuse.engine.graph import supernode_kernels as kernels
 
 # Maximum size of a dense right-hand side, in numbers.
@@ -32,6 +33,24 @@ MAX_FACTOR = 20_000_000
 # Poses whose factor is laid out at once, without trying fewer pairs first.
 _FEW_POSES = 5000
 _MIN_SCALE = 1e-12  # minimum scale of the damping, relative to the largest diagonal entry
+
+
+def equations(
+    e: Float64, information: Float64, weights: Float64 | None = None
+) -> tuple[Float64, Float64]:
+    """Return H (m, 6, 6) and g (m, 6) of measured relative poses.
+
+    Parameters
+    ----------
+    e, information
+        (m, 6) errors log(Z^-1 T_i_j) and (m, 6, 6) information of the measurements Z.
+    weights
+        (m,) factors of the information; by default 1.
+    """
+    weights = np.ones(len(e)) if weights is None else weights
+    H, g = np.empty((len(e), 6, 6)), np.empty((len(e), 6))
+    edge_kernels.normal_equations(e, information, weights, H, g)
+    return H, g
 
 
 class Blocks(NamedTuple):

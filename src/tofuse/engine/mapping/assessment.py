@@ -176,22 +176,28 @@ class Assessment:
     ) -> tuple[pose_accuracy.Accuracy, Float64]:
         """Return the accuracy of the final poses, and their covariances (P, 6, 6).
 
-        Not assessed if covariances of registrations are unrealistic.
+        Bounded by images, then with other sensors, then with even motion: each is used where those
+        before leave poses unbounded, and the verdict says which one bounds them. Not assessed if
+        covariances of registrations are unrealistic.
         """
         if not self.observations.has_covariances:
             return pose_accuracy.Accuracy(), graph_covariances.GraphCovariances(
                 closed.optimisation.graph
             ).of_poses
         observed = self._observed_errors(closed, refined, cross_view)
-
         claimed = self._by_depth(closed, refined)
         measured = self._measured(claimed, refined.refinement).with_poses(refined.graph.poses)
+
+        def covariances_with(
+            sensors: external_sensors.SensorPriors,
+        ) -> graph_covariances.GraphCovariances:
+            graph = external_sensors.with_sensors(measured, sensors).with_edges(refined.color)
+            return graph_covariances.GraphCovariances(graph)
 
         def assessed(
             sensors: external_sensors.SensorPriors, observed: pose_accuracy.ObservedErrors
         ) -> tuple[pose_accuracy.Accuracy, graph_covariances.GraphCovariances]:
-            graph = external_sensors.with_sensors(measured, sensors).with_edges(refined.color)
-            covariances = graph_covariances.GraphCovariances(graph)
+            covariances = covariances_with(sensors)
             bounds = pose_accuracy.accuracy_of(covariances, observed, model.cloud.diagonal_m)
             return bounds, covariances
 
@@ -221,10 +227,9 @@ class Assessment:
             by_odometry=_bounded_since(by_images, by_sensors),
             by_motion=_bounded_since(by_sensors, accuracy),
         )
-        if closed.sensors and not together:
-            del covariances  # only one large factor is in memory
+        if closed.sensors and not together:  # sensors that bound nothing have moved the poses, too
             sensors = replace(closed.sensors, steps=(*closed.sensors.steps, *between))
-            covariances = assessed(sensors, observed)[1]
+            covariances = covariances_with(sensors)
         return accuracy, pose_accuracy.covariances_of(covariances, observed)
 
     def _by_depth(self, closed: Optimised, refined: Refined) -> PoseGraph:

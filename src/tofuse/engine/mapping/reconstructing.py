@@ -43,8 +43,8 @@ class TrackedFrames(Protocol):
         """Return the tracker to use in place of another one."""
         ...
 
-    def finish(self, log: FrameLog) -> None:
-        """Take the log of all frames after tracking."""
+    def finish(self, tracker: Tracker, log: FrameLog) -> None:
+        """Take the tracker from `tracker`, and the log of all frames, after tracking."""
         ...
 
 
@@ -153,7 +153,7 @@ def _track(
             remedy="check that the files are complete, or use --format",
         )
     if tracked_frames is not None:
-        tracked_frames.finish(mapper.log)
+        tracked_frames.finish(tracker, mapper.log)
     return mapper
 
 

@@ -37,7 +37,7 @@ from tofuse.engine.refinement.range_change import (
     likely_change,
     range_change,
 )
-from tofuse.engine.refinement.split_half import aligned_motion
+from tofuse.engine.refinement.split_half import rms_motion
 from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 
@@ -249,8 +249,7 @@ def check_calibration(
         if by_loop.alarm:
             return by_loop
     # Estimated together, correlated errors may be large and opposite.
-    motions = [aligned_motion(refined.poses, e.poses) for e in estimates.values()]
-    largest = max((_rms(position), _rms(rotation)) for position, rotation in motions)
+    largest = max(rms_motion(refined.poses, e.poses) for e in estimates.values())
     return replace(
         without_error,
         alarm=alarm,
@@ -382,11 +381,10 @@ class _Estimator:
             return False
         depth = float(np.median([view.depth for view in self._views]))
         before, after = (
-            aligned_motion(self._witness, se3.inverse(poses[0]) @ poses)
+            rms_motion(self._witness, se3.inverse(poses[0]) @ poses)
             for poses in (self._poses, estimate.poses)
         )
-        rms = [(_rms(position), _rms(rotation)) for position, rotation in (before, after)]
-        return Gap(0, len(self._poses) - 1, rms[0], rms[1], depth).widens
+        return Gap(0, len(self._poses) - 1, before, after, depth).widens
 
     def support_of(self, estimate: AlignedViews) -> tuple[float, float]:
         """Mean support of the views without and with the errors of an estimate."""
@@ -412,14 +410,10 @@ def combine_checks(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:
     return without_alarm[0] if without_alarm else CalibrationCheck()
 
 
-def _rms(vectors: Float64) -> float:
-    return float(np.sqrt((vectors**2).sum(1).mean()))
-
-
 def _motion(poses: Float64, twists: Float64) -> tuple[float, float]:
     """Return the rms motion (m, rad) per unit, given small twists (N, 6) per unit."""
-    position, rotation = aligned_motion(poses, poses @ se3.exp(_DELTA * twists))
-    return _rms(position) / _DELTA, _rms(rotation) / _DELTA
+    m, rad = rms_motion(poses, poses @ se3.exp(_DELTA * twists))
+    return m / _DELTA, rad / _DELTA
 
 
 def _check_by_loop(

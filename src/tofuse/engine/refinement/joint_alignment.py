@@ -22,7 +22,6 @@ from tofuse.engine.graph import external_sensors, robust, sparse
 from tofuse.engine.stored_views import SampledView, overlaps, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 
-WEAK = 1e-3  # information of a weak prior in `UNITS`
 DAMPING = 1e-6  # fraction of the diagonal that is added to it
 
 
@@ -58,15 +57,12 @@ class Priors:
 
     def equations(self, T_i_j: Float64) -> tuple[Float64, Float64]:
         """Return the normal equations (M, 6, 6), (M, 6) at relative poses (M, 4, 4)."""
-        e = se3.log(se3.inverse(self.measured) @ T_i_j)
-        J = se3.jacobian_inverse(e)
-        JtW = np.swapaxes(J, 1, 2) @ self.information
-        return JtW @ J, (JtW @ e[..., None])[..., 0]
+        return sparse.equations(se3.log(se3.inverse(self.measured) @ T_i_j), self.information)
 
 
 def weak_prior(n: int) -> tuple[Float64, Float64]:
     """Return equations (n, 6, 6), (n, 6) that just keep unconstrained poses in place."""
-    return np.tile(np.diag(WEAK / projective.UNITS**2), (n, 1, 1)), np.zeros((n, 6))
+    return np.tile(np.diag(projective.WEAK / projective.UNITS**2), (n, 1, 1)), np.zeros((n, 6))
 
 
 _ERROR_UNIT = 0.01  # of the camera's errors, for their weak prior and convergence
@@ -284,14 +280,16 @@ def align_views(
     motions: list[float] = []
     error_changes = [np.inf]
     overlapping = _overlapping(views, poses, options, bodies) if pairs is None else pairs
-    state = pair_equations.directed_pairs(views, overlapping, options, scales)
+    known = None if scales is None else scales.of(overlapping)
+    state = pair_equations.directed_pairs(views, overlapping, options, known)
     system = _system(state, len(views), priors, bodies)
     motion_since_overlaps = 0.0
     earlier_error_step = np.zeros(kernels.ERRORS)
     for stage in options.rounds:
         if motion_since_overlaps >= _MAX_MOTION:
             overlapping = _overlapping(views, poses, options, bodies)
-            state = pair_equations.directed_pairs(views, overlapping, options, state.known_scales)
+            known = state.known_scales.of(overlapping)
+            state = pair_equations.directed_pairs(views, overlapping, options, known)
             system = _system(state, len(views), priors, bodies)
             motion_since_overlaps = 0.0
         for _ in range(stage.iterations if len(state.target) else 0):
@@ -336,7 +334,8 @@ def support_of(
     options: pair_equations.RefineOptions,
 ) -> Support:
     """Support of the same pairs at other poses (N, 4, 4), with the same sigmas."""
-    state = pair_equations.directed_pairs(views, refined.pairs, options, refined.scales)
+    scales = refined.scales.of(refined.pairs)
+    state = pair_equations.directed_pairs(views, refined.pairs, options, scales)
     fixed_errors = (refined.errors == 0).astype(np.int64)
     return _support(views, poses, refined.errors, fixed_errors, state, options.rounds[-1], options)
 
@@ -387,10 +386,7 @@ def align_pairs(
     ends = np.arange(2 * count).reshape(-1, 2)
     poses = np.tile(np.eye(4), (2 * count, 1, 1))
     poses[1::2] = T_i_j
-    i, j = pairs.T
-    known = scales.of(np.concatenate([i, j]), np.concatenate([j, i]))
-    doubled = pair_equations.KnownScales(ends.T.ravel(), ends[:, ::-1].T.ravel(), known)
-    state = pair_equations.directed_pairs(views, ends, options, doubled)
+    state = pair_equations.directed_pairs(views, ends, options, scales.of(pairs))
     fixed_errors, stage = np.ones(len(errors), np.int64), options.rounds[-1]
     active = np.arange(count)
     for _ in range(_PAIR_ITERATIONS):
@@ -473,9 +469,8 @@ def _pairwise_measurements(
     At = np.swapaxes(A, 1, 2)
     H = H[:count] + At @ H[count:] @ A
     g = g[:count] + (At @ g[count:, :, None])[..., 0]
-    scaled = H * np.outer(projective.UNITS, projective.UNITS) + WEAK * np.eye(6)
-    step = -np.linalg.solve(scaled, (g * projective.UNITS)[..., None])[..., 0] * projective.UNITS
-    return T_i_j @ se3.exp(step), scaled / np.outer(projective.UNITS, projective.UNITS)
+    step, information = projective.step_with_weak_prior(H, g)
+    return T_i_j @ se3.exp(step), information
 
 
 def _system(
@@ -522,7 +517,7 @@ def _solve(
         H[:, 6:, 6:].sum(0),
         g[:, 6:].sum(0),
     )
-    damping = WEAK / _ERROR_UNIT**2 + DAMPING * shared.H.diagonal()
+    damping = projective.WEAK / _ERROR_UNIT**2 + DAMPING * shared.H.diagonal()
     if priors.gravity is not None:
         damping = np.append(damping, np.zeros(2))
         _add_gravity(poses, priors.gravity, unary, shared, system)

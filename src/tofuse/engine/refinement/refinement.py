@@ -28,7 +28,7 @@ from tofuse.engine.refinement.joint_alignment import (
 )
 from tofuse.engine.refinement.loop_drift import loop_gap
 from tofuse.engine.refinement.range_change import RangeChange
-from tofuse.engine.refinement.split_half import aligned_motion, split_half_errors
+from tofuse.engine.refinement.split_half import rms_motion, split_half_errors
 from tofuse.engine.refinement.submaps import RefinedSubmap, refine_submaps
 from tofuse.engine.stored_views import (
     CoarseView,
@@ -267,7 +267,7 @@ class _Joint(Refiner):
         disputed_m = disputed_rad = 0.0
         if mean[1] < mean[0]:
             # The poses were already at the optimum; the measurements give their covariances.
-            disputed_m, disputed_rad = (_rms(m) for m in aligned_motion(before, after))
+            disputed_m, disputed_rad = rms_motion(before, after)
             after = before
         split_m, split_rad = _mean_errors([split for _, split in evaluated])
         return replace(
@@ -323,11 +323,6 @@ class _Joint(Refiner):
 
     def _sampled(self, posed: PosedView[PreparedView]) -> SampledView:
         return SampledView.of(_surface(posed), self._options.alignment.points)
-
-
-def _rms(motions: Float64) -> float:
-    """Rms length of motions (N, 3)."""
-    return float(np.sqrt((motions**2).sum(1).mean()))
 
 
 def _mean_errors(errors: Sequence[tuple[float, float]]) -> tuple[float, float]:

@@ -115,3 +115,9 @@ def aligned_motion(before: Float64, after: Float64) -> tuple[Float64, Float64]:
         -1, 3
     )
     return translation, rotation - rotation.mean(0)
+
+
+def rms_motion(before: Float64, after: Float64) -> tuple[float, float]:
+    """Return the rms of `aligned_motion`, m and rad."""
+    m, rad = (float(np.sqrt((v**2).sum(1).mean())) for v in aligned_motion(before, after))
+    return m, rad

@@ -15,7 +15,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import PoseGraph, levenberg
@@ -27,6 +26,7 @@ from tofuse.engine.refinement.joint_alignment import (
     spread_evenly,
     support_fell,
     support_of,
+    weak_prior,
 )
 from tofuse.engine.stored_views import (
     HasCoarseView,
@@ -41,8 +41,6 @@ A = TypeVar("A")
 
 # Largest number of neighbouring views in a submap, as a fraction of its core views.
 _BORDER = 0.25
-# Information of a weak prior on the motion between views, in units of 1 cm and 1 degree.
-_WEAK_PRIOR = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +235,7 @@ def _optimised_poses(
     previous = np.arange(len(poses) - 1)
     steps = np.stack([previous, previous + 1], 1)
     # Parts of the path that no pair connects keep their relative pose.
-    weak = np.tile(np.diag(_WEAK_PRIOR / projective.UNITS**2), (len(steps), 1, 1))
+    weak, _ = weak_prior(len(steps))
     edges = np.concatenate([pairs, priors.pairs, steps])
     graph = PoseGraph(
         ids=np.arange(len(poses)),

@@ -183,7 +183,7 @@ def count_periods(
     def update(start: int, stop: int, parity: int) -> None:
         pass_messages(
             blocks.range_m, blocks.valid, unary, period_m, options.scale * period_m,
-            options.max_difference_cost, 1.0, start, stop, parity, messages,
+            options.max_difference_cost, start, stop, parity, messages,
         )  # fmt: skip
 
     for step in range(2 * options.iterations):

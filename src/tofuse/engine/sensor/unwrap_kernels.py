@@ -19,7 +19,6 @@ def pass_messages(
     period: float,
     scale: float,
     truncation: float,
-    weight: float,
     start: int,
     stop: int,
     parity: int,
@@ -36,8 +35,8 @@ def pass_messages(
         Wrapped range in [0, period).
     unary (H, W, K)
         Cost of each number of periods.
-    period, scale, truncation, weight
-        Neighbours with unwrapped ranges a and b cost weight * min(|a - b| / scale, truncation).
+    period, scale, truncation
+        Neighbours with unwrapped ranges a and b cost min(|a - b| / scale, truncation).
     start, stop, parity
         Rows whose pixels (i + j) % 2 == parity send.
     messages (4, H, W, K)
@@ -67,7 +66,7 @@ def pass_messages(
                     best = np.inf
                     for k in range(labels):
                         jump = abs(difference + (m - k) * period) / scale
-                        best = min(best, belief[k] + weight * min(jump, truncation))
+                        best = min(best, belief[k] + min(jump, truncation))
                     sent[m] = best
                     lowest = min(lowest, best)
                 opposite = (s + 2) % 4

@@ -20,7 +20,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views import shared_error
 from tofuse.engine.stored_views.pair_equation_kernels import marginalise_shared_errors
-from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.engine.stored_views.view_store import SampledView, by_target
 from tofuse.engine.views import residual_kernels
 
 # Pairs of a chunk, of which the equations, or the errors of patches, are computed.
@@ -162,8 +162,9 @@ class KnownScales:
     source: Intp
     scales: Float64
 
-    def of(self, target: Intp, source: Intp) -> Float64:
-        """(Q, 3) those of other directed pairs; usual ones where they are unknown."""
+    def of(self, pairs: Intp) -> Float64:
+        """(2 M, 3) those of both directions of pairs (M, 2); usual ones where they are unknown."""
+        target, source = _both_directions(pairs)
         scales = np.tile(_USUAL_SCALES, (len(target), 1))
         row = {ts: k for k, ts in enumerate(zip(self.target, self.source, strict=True))}
         rows = np.array([row.get(ts, -1) for ts in zip(target, source, strict=True)], np.intp)
@@ -171,20 +172,25 @@ class KnownScales:
         return scales
 
 
+def _both_directions(pairs: Intp) -> tuple[Intp, Intp]:
+    """Return the targets and sources (2 M,) of pairs (M, 2), first of all (i, j), then (j, i)."""
+    i, j = pairs.T
+    return np.concatenate([i, j]), np.concatenate([j, i])
+
+
 def directed_pairs(
     views: Sequence[SampledView],
     pairs: Intp,
     options: RefineOptions,
-    known: KnownScales | None = None,
+    scales: Float64 | None = None,
 ) -> DirectedPairs:
-    """Return both directions of each pair (M, 2), with `known` scales, if any.
+    """Return both directions of each pair (M, 2), with `scales` as of `KnownScales.of`, if any.
 
     `views` (N,) and `options` are as for `joint_alignment.refine`.
     """
-    target = np.concatenate([pairs[:, 0], pairs[:, 1]])
-    source = np.concatenate([pairs[:, 1], pairs[:, 0]])
+    target, source = _both_directions(pairs)
     max_scale = np.maximum(3.0, options.max_sigma_m / np.array([v.sigma for v in views]))
-    scales = np.tile(_USUAL_SCALES, (len(target), 1)) if known is None else known.of(target, source)
+    scales = np.tile(_USUAL_SCALES, (len(target), 1)) if scales is None else scales
     exposure, scale_g, scale_p = scales.T.copy()
     photometric = np.array([v.has_albedo for v in views]) & options.photometric
     scale_p[~(photometric[target] & photometric[source])] = 0.0
@@ -240,16 +246,13 @@ def evaluate(
     by_patch
         Whether to sum over patches as well, for `discount_shared`.
     """
-    # All sources of a target in succession, so that it stays in the cache.
-    order = np.argsort(state.target, kind="stable")
+    order, targets, ends = by_target(state.target)
     target, source = state.target[order], state.source[order]
     exposure, scale_g, scale_p = (column[order] for column in state._scales())
     T_target_source = se3.inverse(poses[target]) @ poses[source]
     rows = np.empty((len(target), kernels.SIZE))
     sums = np.empty((len(rows), shared_error.PATCHES if by_patch else 0, kernels.PATCH_SIZE))
     cosine = float(np.cos(options.max_angle))
-    targets, begin = np.unique(target, return_index=True)
-    ends = np.append(begin, len(target))
 
     def work(a: int, b: int) -> None:
         for first in range(a, b, kernels.TARGETS):

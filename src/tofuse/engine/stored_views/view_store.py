@@ -498,12 +498,12 @@ def _visible_fractions(
         else np.zeros((0, residual_kernels.POINT_SIZE), np.float32)
     )
     inverse, used_poses = se3.inverse(poses), np.ascontiguousarray(poses[used])
-    # All sources of a target in succession, so that it stays in the cache.
-    by_target = rows_by_target(target)
+    order, targets, ends = by_target(target)
     out = np.zeros(len(target))
 
     def work(a: int, b: int) -> None:
-        for k, rows in by_target[a:b]:
+        for t in range(a, b):
+            k, rows = targets[t], order[ends[t] : ends[t + 1]]
             view = views[k].coarse
             fractions = np.empty(len(rows))
             kernels.overlaps(
@@ -522,14 +522,15 @@ def _visible_fractions(
             )
             out[rows] = fractions
 
-    run_chunks(work, len(by_target), 32)
+    run_chunks(work, len(targets), 32)
     return out
 
 
-def rows_by_target(target: Intp) -> list[tuple[int, Intp]]:
-    """Return each target (M,) of pairs, ascending, with the rows of its pairs."""
+def by_target(target: Intp) -> tuple[Intp, Intp, Intp]:
+    """Return the order of pairs by their targets (M,), the T targets, and where each begins.
+
+    The last is (T + 1,), with the end. All sources of a target in succession keep it in the cache.
+    """
     order = np.argsort(target, kind="stable")
     targets, begin = np.unique(target[order], return_index=True)
-    return (
-        list(zip(targets.tolist(), np.split(order, begin[1:]), strict=True)) if len(order) else []
-    )
+    return order, targets, np.append(begin, len(target))

@@ -131,8 +131,6 @@ class Moving:
     scale
         Robust scale of the residuals outside of the previous mask, in sigmas of noise and
         `_MODEL_ERROR`.
-    segments
-        Connected components of `view`.
     reliable
         Whether the pair agreed enough for its disagreements to be counted as motion. If not, the
         masks are propagated from earlier frames.
@@ -146,7 +144,6 @@ class Moving:
     compared: int
     agreement: float
     scale: float
-    segments: int
     reliable: bool
     pair_update: PairUpdate
 
@@ -330,8 +327,8 @@ class MovingObjects:
         else:
             evidence, reference_evidence = cells.odds, reference_cells.odds
         detect = 0.0 if suspected else _DETECT
-        cells, segments = self._segmented(cells._replace(tracked=tracked), evidence, detect)
-        reference_cells, _ = self._segmented(reference_cells, reference_evidence, detect)
+        cells = self._segmented(cells._replace(tracked=tracked), evidence, detect)
+        reference_cells = self._segmented(reference_cells, reference_evidence, detect)
         counts = _counts(outcome, cells.moving) + _counts(reference_outcome, reference_cells.moving)
         mask = _pixels(cells.moving, view.z.shape, stride_of(view))
         valid = view.z > 0
@@ -342,7 +339,6 @@ class MovingObjects:
             compared=int(counts.sum()),
             agreement=float(counts[0] / max(counts.sum(), 1)),
             scale=scale,
-            segments=segments,
             reliable=reliable,
             pair_update=PairUpdate(
                 _LastView(view, T_world_camera, cells),
@@ -440,10 +436,8 @@ class MovingObjects:
         max_odds = _DETECT + 2 * _MAX_EVIDENCE
         return cells._replace(odds=np.clip(odds, 2 * prior, max_odds).astype(np.float32))
 
-    def _segmented(
-        self, cells: kernels.Cells, evidence: Float32, detect: float
-    ) -> tuple[kernels.Cells, int]:
-        """Segment cells with hysteresis, and count the segments.
+    def _segmented(self, cells: kernels.Cells, evidence: Float32, detect: float) -> kernels.Cells:
+        """Segment cells with hysteresis.
 
         `evidence` is that of this frame: segments are not extended over cells that agree in it.
         """
@@ -451,7 +445,7 @@ class MovingObjects:
         certain = odds > detect
         unsegmented = cells._replace(moving=np.zeros(odds.shape, np.bool_))
         if not certain.any():
-            return unsegmented, 0
+            return unsegmented
         likely = (odds > _EXTEND).view(np.uint8)
         likely = np.asarray(cv2.morphologyEx(likely, cv2.MORPH_OPEN, _NEIGHBOURS), np.uint8)
         count, labels, stats, _ = cv2.connectedComponentsWithStats(likely, connectivity=4)
@@ -460,7 +454,7 @@ class MovingObjects:
         kept = (core >= _MIN_CORE * sizes) & (sizes >= _MIN_SIZE * odds.size)
         kept[0] = False
         if not kept.any():
-            return unsegmented, 0
+            return unsegmented
         moving = self._completed(kept[labels], depth)
         # All of a segment moves as likely as its core, unless this frame shows that it is static.
         odds = np.where(moving & (evidence >= 0), np.maximum(odds, np.float32(_CORE)), odds)
@@ -472,7 +466,7 @@ class MovingObjects:
             np.abs(near_depth - depth) <= np.float32(_MAX_MOTION) * near_depth
         )
         moving = moving | (dilated & (evidence >= 0) & (odds >= _PRIOR_ODDS))
-        return cells._replace(odds=odds, moving=moving), int(kept.sum())
+        return cells._replace(odds=odds, moving=moving)
 
     def _completed(self, moving: Bool, depth: Float32) -> Bool:
         """Complete the mask on surfaces of which more than half moves.

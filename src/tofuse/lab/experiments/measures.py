@@ -31,8 +31,9 @@ class PathScore:
     drift
         (N, 3) error of the position along x, y, z of the first camera, m, without alignment:
         the cumulative error of figures 5.2 and 5.6. NaN where lost.
-    step_m, step_deg
-        (N,) error of the motion since the frame before; NaN for the first and where lost.
+    step_m
+        (N,) length of the error of the motion since the frame before; NaN for the first and where
+        lost.
     """
 
     ate_m: float
@@ -41,7 +42,6 @@ class PathScore:
     end_deg: float
     drift: Float64
     step_m: Float64
-    step_deg: Float64
 
     @property
     def axes_rms_m(self) -> Float64:
@@ -55,20 +55,14 @@ def score_path(poses: Float64, truth: Float64) -> PathScore:
     error = trajectory_errors.evaluate_trajectory(times, poses, times, truth)
     last = int(np.flatnonzero(np.isfinite(poses[:, 0, 0]))[-1])
     end = se3.inverse(truth[last]) @ poses[last]
-    step_m, step_deg = np.full((2, len(poses)), np.nan)
-    if len(poses) > 1:
-        motion_errors = se3.inverse(motions(truth)) @ motions(poses)
-        step_m[1:] = np.linalg.norm(motion_errors[:, :3, 3], axis=1)
-        valid = np.flatnonzero(np.isfinite(motion_errors[:, 0, 0]))
-        step_deg[1 + valid] = np.degrees(se3.angle(motion_errors[valid]))
+    motion_errors = se3.inverse(motions(truth)) @ motions(poses)
     return PathScore(
         error.ate_rms_m,
         float(np.degrees(error.rotation_rms_rad)),
         float(np.linalg.norm(end[:3, 3])),
         float(np.degrees(se3.angle(end))),
         poses[:, :3, 3] - truth[:, :3, 3],
-        step_m,
-        step_deg,
+        np.append(np.nan, np.linalg.norm(motion_errors[:, :3, 3], axis=1)),
     )
 
 

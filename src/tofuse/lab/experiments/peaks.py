@@ -12,7 +12,6 @@ from tofuse.engine.frames import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import (
     Measured,
-    Optimiser,
     PoseGraph,
     build_graph,
     castellani,
@@ -110,7 +109,7 @@ def chain(relative: Float64, loops: Sequence[Measured] = ()) -> PoseGraph:
     return build_graph(range(len(poses)), np.array(poses), sequence, loops)
 
 
-def run_peaks(sigma: float, seed: int, optimiser: Optimiser | None = None) -> PeaksRun:
+def run_peaks(sigma: float, seed: int) -> PeaksRun:
     """Register the 20 views in sequence, and close the loop by its true motion.
 
     All points are used, with a resolution of 1 m and the previous motion as guess; Algorithm 1
@@ -124,7 +123,7 @@ def run_peaks(sigma: float, seed: int, optimiser: Optimiser | None = None) -> Pe
     relative = np.array([s.registration.T_target_source for s in steps[1:] if s.registration])
     last = len(views) - 1
     graph = chain(relative, [Measured(0, last, truth[last], np.eye(6))])
-    optimisation = (optimiser or castellani.Castellani()).optimise(graph)
+    optimisation = castellani.Castellani().optimise(graph)
     return PeaksRun(
         sigma,
         seed,

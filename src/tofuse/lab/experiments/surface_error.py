@@ -12,6 +12,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import KdTree, triangles
 
 _SAMPLES = 400_000  # points on a mesh
+_OUTLIER_M = 0.05
 _CANDIDATES = 4  # nearest samples of a mesh whose triangles are tested
 
 
@@ -88,9 +89,9 @@ class SurfaceErrors:
         Fraction of the model within `threshold_m` of the reference, of the reference within
         `threshold_m` of the model, and their harmonic mean.
     outliers
-        Fraction of the model farther than `outlier_m` from the reference.
-    threshold_m, outlier_m
-        The limits, m.
+        Fraction of the model farther than 5 cm from the reference.
+    threshold_m
+        The limit, m.
     """
 
     accuracy_m: float
@@ -102,7 +103,6 @@ class SurfaceErrors:
     fscore: float
     outliers: float
     threshold_m: float
-    outlier_m: float
 
 
 def compare_surfaces(
@@ -110,7 +110,6 @@ def compare_surfaces(
     reference: Surface,
     *,
     threshold_m: float = 0.01,
-    outlier_m: float = 0.05,
     visible: ArrayLike | None = None,
     samples: int = _SAMPLES,
 ) -> SurfaceErrors:
@@ -120,8 +119,8 @@ def compare_surfaces(
     ----------
     model, reference
         Meshes or clouds. Distances to a mesh are those to its triangles.
-    threshold_m, outlier_m
-        Maximum distance of an inlier, and minimum distance of an outlier, m.
+    threshold_m
+        Maximum distance of an inlier, m.
     visible
         (K, 3) visible points of the reference, the only ones that completeness counts; by default
         the entire reference.
@@ -153,9 +152,8 @@ def compare_surfaces(
         precision,
         recall,
         2 * precision * recall / total if total else 0.0,
-        float((model_distances > outlier_m).mean()),
+        float((model_distances > _OUTLIER_M).mean()),
         threshold_m,
-        outlier_m,
     )
 
 

@@ -133,9 +133,7 @@ class ChartProblem(solver.Problem):
         return self.chart.retract(poses, step)
 
 
-def descend(
-    graph: PoseGraph, chart: Chart, tolerance: float, iterations: int = 100
-) -> solver.Descent:
+def descend(graph: PoseGraph, chart: Chart, tolerance: float) -> solver.Descent:
     """Minimise the squared errors of all edges and of gravity in the parameters of a chart.
 
     Parameters
@@ -144,10 +142,10 @@ def descend(
         With the initial poses.
     chart
         The parametrisation.
-    tolerance, iterations
-        Stopping rule, see `Descent.run`.
+    tolerance
+        See `Descent.run`.
     """
     problem = ChartProblem(graph, chart)
     descent = solver.Descent(problem, problem.start(graph.poses))
-    descent.run(lambda x: x, np.ones_like, tolerance, iterations)
+    descent.run(lambda x: x, np.ones_like, tolerance, 100)
     return descent

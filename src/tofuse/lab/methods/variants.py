@@ -68,114 +68,74 @@ class InTurn(Bounded, Registrar):
         return registration
 
 
-def _surface_icp(
-    resolution: float,
-    points: int | None,
-    reach: float,
-    max_iterations: int,
-    metric: interfaces.Metric,
-) -> Icp:
-    return Icp(
-        resolution,
-        source=icp_parts.at_most(points),
-        target=icp_parts.All(),
-        rejectors=(icp_parts.MaxDistance(reach),),
-        metric=metric,
-        stopping=icp_parts.SmallStep(max_iterations=max_iterations),
-    )
+@dataclass(frozen=True)
+class _ClosestPoints(Variant):
+    """ICP with closest points, and any metric.
+
+    Attributes
+    ----------
+    resolution
+        Typical distance between neighbouring points, m.
+    points
+        Random points of the source (None: all), against all of the target.
+    reach
+        Largest distance of a pair, in resolutions.
+    max_iterations
+        Maximum number of iterations.
+    """
+
+    resolution: float = 0.01
+    points: int | None = 1000
+    reach: float = 5.0
+    max_iterations: int = 50
+
+    def _with_metric(self, metric: interfaces.Metric) -> Icp:
+        return Icp(
+            self.resolution,
+            source=icp_parts.at_most(self.points),
+            target=icp_parts.All(),
+            rejectors=(icp_parts.MaxDistance(self.reach),),
+            metric=metric,
+            stopping=icp_parts.SmallStep(max_iterations=self.max_iterations),
+        )
 
 
 @part("registration", "point-to-plane", label="validated")
 @dataclass(frozen=True)
-class PointToPlaneIcp(Variant):
-    """Point-to-plane ICP (Chen and Medioni 1992) with closest points.
-
-    Attributes
-    ----------
-    resolution
-        Typical distance between neighbouring points, m.
-    points
-        Random points of the source (None: all), against all of the target.
-    reach
-        Largest distance of a pair, in resolutions.
-    max_iterations
-        Maximum number of iterations.
-    """
-
-    resolution: float = 0.01
-    points: int | None = 1000
-    reach: float = 5.0
-    max_iterations: int = 50
+class PointToPlaneIcp(_ClosestPoints):
+    """Point-to-plane ICP (Chen and Medioni 1992) with closest points."""
 
     def parts(self) -> Icp:
         """See `Variant.parts`."""
-        return _surface_icp(
-            self.resolution,
-            self.points,
-            self.reach,
-            self.max_iterations,
-            surface_metrics.PointToPlane(),
-        )
+        return self._with_metric(surface_metrics.PointToPlane())
 
 
 @part("registration", "symmetric", label="validated")
 @dataclass(frozen=True)
-class SymmetricIcp(Variant):
-    """ICP with the symmetric objective (Rusinkiewicz 2019) and closest points.
-
-    Attributes
-    ----------
-    resolution
-        Typical distance between neighbouring points, m.
-    points
-        Random points of the source (None: all), against all of the target.
-    reach
-        Largest distance of a pair, in resolutions.
-    max_iterations
-        Maximum number of iterations.
-    """
-
-    resolution: float = 0.01
-    points: int | None = 1000
-    reach: float = 5.0
-    max_iterations: int = 50
+class SymmetricIcp(_ClosestPoints):
+    """ICP with the symmetric objective (Rusinkiewicz 2019) and closest points."""
 
     def parts(self) -> Icp:
         """See `Variant.parts`."""
-        return _surface_icp(
-            self.resolution, self.points, self.reach, self.max_iterations, Symmetric()
-        )
+        return self._with_metric(Symmetric())
 
 
 @part("registration", "gicp", label="validated")
 @dataclass(frozen=True)
-class GeneralizedIcp(Variant):
+class GeneralizedIcp(_ClosestPoints):
     """Generalised ICP, plane to plane (Segal, Haehnel and Thrun 2009).
 
     Attributes
     ----------
-    resolution
-        Typical distance between neighbouring points, m.
-    points
-        Random points of the source (None: all), against all of the target.
-    reach
-        Largest distance of a pair, in resolutions.
-    max_iterations
-        Maximum number of iterations.
     epsilon
         Variance across a surface relative to that along it.
     """
 
-    resolution: float = 0.01
-    points: int | None = 1000
-    reach: float = 5.0
-    max_iterations: int = 50
     epsilon: float = 1e-3
 
     def parts(self) -> Icp:
         """See `Variant.parts`."""
-        metric = surface_metrics.PlaneToPlane(self.epsilon)
-        return _surface_icp(self.resolution, self.points, self.reach, self.max_iterations, metric)
+        return self._with_metric(surface_metrics.PlaneToPlane(self.epsilon))
 
 
 @part("registration", "tricp", label="validated")
@@ -263,7 +223,7 @@ class Tricp(Bounded, Registrar):
 
 @part("registration", "iccp", label="validated")
 @dataclass(frozen=True)
-class Iccp(Variant):
+class Iccp(_ClosestPoints):
     """Iterative Closest Compatible Point (Godin, Rioux and Baribeau 1994).
 
     Only points of similar amplitude are paired, so that texture constrains what the shape does not.
@@ -271,40 +231,23 @@ class Iccp(Variant):
 
     Attributes
     ----------
-    resolution
-        Typical distance between neighbouring points, m.
-    points
-        Random points of the source (None: all), against all of the target.
     ratio
         Largest ratio of two compatible amplitudes.
-    reach
-        Largest distance of a pair, in resolutions.
-    max_iterations
-        Maximum number of iterations.
     """
 
-    resolution: float = 0.01
-    points: int | None = 1000
-    ratio: float = 1.2
     reach: float = 10.0
     max_iterations: int = 100
+    ratio: float = 1.2
 
     def parts(self) -> Icp:
         """See `Variant.parts`."""
-        return Icp(
-            self.resolution,
-            source=icp_parts.at_most(self.points),
-            target=icp_parts.All(),
-            matcher=ClosestCompatible(self.ratio),
-            rejectors=(icp_parts.MaxDistance(self.reach),),
-            metric=icp_parts.PointToPoint(),
-            stopping=icp_parts.SmallStep(max_iterations=self.max_iterations),
-        )
+        plain = self._with_metric(icp_parts.PointToPoint())
+        return replace(plain, matcher=ClosestCompatible(self.ratio))
 
 
 @part("registration", "icpif", label="validated")
 @dataclass(frozen=True)
-class Icpif(Variant):
+class Icpif(_ClosestPoints):
     """ICP using invariant features (Sharp, Lee and Wehe 2002).
 
     Points are paired by their distance in space and in pose-invariant features, which enlarges the
@@ -312,10 +255,6 @@ class Icpif(Variant):
 
     Attributes
     ----------
-    resolution
-        Typical distance between neighbouring points, m.
-    points
-        Random points of the source (None: all), against all of the target.
     features
         Any of "curvature", "moments".
     weight
@@ -328,23 +267,14 @@ class Icpif(Variant):
         Of each of the two.
     """
 
-    resolution: float = 0.01
-    points: int | None = 1000
+    reach: float = 3.0
+    max_iterations: int = 100
     features: tuple[Invariant, ...] = ("moments",)
     weight: float = 20.0
     radius: float = 6.0
-    reach: float = 3.0
-    max_iterations: int = 100
 
     def parts(self) -> InTurn:
         """See `Variant.parts`."""
-        plain = Icp(
-            self.resolution,
-            source=icp_parts.at_most(self.points),
-            target=icp_parts.All(),
-            rejectors=(icp_parts.MaxDistance(self.reach),),
-            metric=icp_parts.PointToPoint(),
-            stopping=icp_parts.SmallStep(max_iterations=self.max_iterations),
-        )
+        plain = self._with_metric(icp_parts.PointToPoint())
         matcher = ClosestInvariant(self.features, self.weight, self.radius)
         return InTurn((replace(plain, matcher=matcher, rejectors=(icp_parts.Unique(),)), plain))

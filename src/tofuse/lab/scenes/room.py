@@ -48,7 +48,7 @@ def plan(options: SceneOptions) -> ScenePlan:
     if options.name == "room":
         _chairs(assembly, np.random.default_rng([options.seed, 3]))
     camera = paths.look_at((0, 0, CAMERA_HEIGHT), (1, 0.2, CAMERA_HEIGHT))
-    path = paths.camera_turn(camera, options.seconds, options.axis_offset_m)
+    path = paths.camera_turn(camera, options.seconds)
     return ScenePlan(assembly.materials, assembly.mesh(), path, ambient=0.4)
 
 

@@ -104,7 +104,6 @@ def plan(
     frames: int | None = None,
     first: int = 0,
     texture: bool = True,
-    axis_offset_m: float = 0.0,
     passing: Passing | None = None,
     mirror: tuple[float, float] | None = None,
 ) -> RecordingPlan:
@@ -117,7 +116,7 @@ def plan(
         of range.
     """
     model = camera_model(camera)
-    built, sequence = scenes.build(scene, seed=seed, texture=texture, axis_offset_m=axis_offset_m)
+    built, sequence = scenes.build(scene, seed=seed, texture=texture)
     raw = sequence.selected(every, frames, first)
     if mirror is not None:
         times = raw / sequence.frame_rate_hz
@@ -142,7 +141,6 @@ def simulate_recording(
     first: int = 0,
     correction: bool = True,
     texture: bool = True,
-    axis_offset_m: float = 0.0,
     passing: Passing | None = None,
     mirror: tuple[float, float] | None = None,
     sigma_m: float = 0.05,
@@ -166,7 +164,6 @@ def simulate_recording(
         frames=frames,
         first=first,
         texture=texture,
-        axis_offset_m=axis_offset_m,
         passing=passing,
         mirror=mirror,
     )
@@ -185,7 +182,6 @@ def simulate(
     first: int = 0,
     correction: bool = True,
     texture: bool = True,
-    axis_offset_m: float = 0.0,
     passing: Passing | None = None,
     mirror: tuple[float, float] | None = None,
     imu: bool = False,
@@ -216,8 +212,6 @@ def simulate(
         Whether the factory correction is written along with the (uncorrected) depth.
     texture
         False gives every surface the same albedo.
-    axis_offset_m
-        See `scene.build`.
     passing
         A distractor that passes through the view; its pixels are flagged in truth/flags. It is not
         part of the surface in truth/.
@@ -252,7 +246,6 @@ def simulate(
         frames=frames,
         first=first,
         texture=texture,
-        axis_offset_m=axis_offset_m,
         passing=passing,
         mirror=mirror,
     )

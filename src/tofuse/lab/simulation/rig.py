@@ -83,7 +83,6 @@ def simulate_rig(
     *,
     first_s: float = 0.0,
     frames: int = 1,
-    every: int = 1,
     effects: Effects = _DEFAULT,
     seed: int = 0,
 ) -> list[Recording]:
@@ -95,15 +94,15 @@ def simulate_rig(
         The scene, and the motion of the rig (the sequence's camera) and of all bodies.
     first_s
         Start in s, by the rig's clock; timestamps are those of the cameras' own clocks.
-    frames, every
-        Images per camera, and the stride.
+    frames
+        Images per camera.
     """
     recordings = []
     for k, mount in enumerate(mounts):
         camera_sequence = mount.sequence(sequence)
         first_own_s = max(first_s - mount.time_offset_s, 0.0)  # a recording has no earlier frame
         first = int(np.ceil(first_own_s * mount.frame_rate_hz - 1e-9))
-        raw = first + every * np.arange(frames)
+        raw = first + np.arange(frames)
         planned = RecordingPlan(scene, camera_sequence, mount.model, effects, 1000 * seed + k, raw)
         images = [
             _apply_camera_errors(planned, mount, rendered.frame)

@@ -335,20 +335,17 @@ class SceneKind:
         Module of `tofuse.lab.scenes` that builds it.
     frames, stride
         Number of raw frames of the whole sequence, and the thesis's stride.
-    turns
-        Whether the camera rotates on a stand, so that `axis_offset_m` applies.
     """
 
     summary: str
     module: str
     frames: int
     stride: int
-    turns: bool = False
 
 
 SCENES: dict[str, SceneKind] = {
-    "room": SceneKind("one turn in a room with seven office chairs", "room", 384, 3, True),
-    "empty-room": SceneKind("one turn in the same room, empty", "room", 405, 3, True),
+    "room": SceneKind("one turn in a room with seven office chairs", "room", 384, 3),
+    "empty-room": SceneKind("one turn in the same room, empty", "room", 405, 3),
     "rail": SceneKind("0.90 m to the side and back, facing an office desk", "rail", 315, 5),
     "torso": SceneKind("a person on a rotating chair, one turn", "torso", 222, 6),
     "box": SceneKind("a box of 300 x 300 x 400 mm on a stand, one turn", "box", 570, 10),
@@ -373,7 +370,6 @@ class SceneOptions:
     name: str
     seed: int
     seconds: float
-    axis_offset_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -389,14 +385,7 @@ class ScenePlan:
     max_depth_m: float | None = None
 
 
-def build(
-    name: str,
-    *,
-    seed: int = 0,
-    texture: bool = True,
-    frames: int | None = None,
-    axis_offset_m: float = 0.0,
-) -> tuple[Scene, Sequence]:
+def build(name: str, *, seed: int = 0, texture: bool = True) -> tuple[Scene, Sequence]:
     """Build a scene and its sequence.
 
     Parameters
@@ -407,30 +396,18 @@ def build(
         Seed of the textures and of the furniture's orientation.
     texture
         False gives every surface the same matte albedo.
-    frames
-        Number of raw frames to stop after; the motion is the same. All if not given.
-    axis_offset_m
-        Distance in m of the optical centre in front of the rotation axis of the stand.
 
     Raises
     ------
     InputError
-        For an unknown name, no frames, or an axis offset without a rotating camera.
+        For an unknown name.
     """
     kind = SCENES.get(name)
     if kind is None:
         raise InputError(
             f"there is no scene {name!r}", where="scene", remedy=f"use one of {', '.join(SCENES)}"
         )
-    if frames is not None and frames < 1:
-        raise InputError(f"is {frames}", where="frames", remedy="ask for at least 1")
-    if axis_offset_m != 0.0 and not kind.turns:
-        raise InputError(
-            f"the camera of scene {name!r} does not turn on a stand",
-            where="axis_offset_m",
-            remedy="leave it at 0",
-        )
-    options = SceneOptions(name, seed, kind.frames / FRAME_RATE_HZ, axis_offset_m)
+    options = SceneOptions(name, seed, kind.frames / FRAME_RATE_HZ)
     plan: ScenePlan = importlib.import_module(f"tofuse.lab.scenes.{kind.module}").plan(options)
     scene = Scene(
         name,
@@ -441,5 +418,5 @@ def build(
         max_depth_m=plan.max_depth_m,
         seed=seed,
     )
-    count = kind.frames if frames is None else frames
-    return scene, Sequence(count, kind.stride, FRAME_RATE_HZ, plan.camera_path, plan.object_path)
+    sequence = Sequence(kind.frames, kind.stride, FRAME_RATE_HZ, plan.camera_path, plan.object_path)
+    return scene, sequence
