@@ -11,6 +11,7 @@ from tofuse.engine.refinement.calibration_check import (
     check_calibration,
     combine_checks,
 )
+from tofuse.engine.refinement.camera_response import Response
 from tofuse.engine.refinement.joint_alignment import Priors, refine
 from tofuse.engine.refinement.range_change import RangeChange
 from tofuse.engine.stored_views.view_store import SampledView
@@ -49,6 +50,37 @@ def test_drift_of_range_is_found(right: list[SampledView]) -> None:
     assert found.frame is None
     assert found.change == pytest.approx(0.08, abs=0.01)
     assert "drifts" in found.in_words()
+
+
+def test_errors_that_differ_from_room_to_room_are_no_change(right: list[SampledView]) -> None:
+    check = checked(right, np.repeat([1.0, 1.01, 1.03, 1.02], VIEWS // 4))
+    assert check.range_change is None
+    # Poses follow nevertheless: a part of that counts.
+    assert check.changed[0] > 0
+    assert not check.change_confirmed
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
+def test_sigma_of_serial_errors(correlation: float) -> None:
+    # Any two views that share a pair have its error: there are two equal series.
+    count, draws = 100, 300
+    rng = np.random.default_rng(0)
+    e = rng.normal(size=(count, draws))
+    for k in range(1, count):
+        e[k] += correlation * e[k - 1]
+    pairs = np.stack([np.arange(count), count + np.arange(count)], 1)
+    response = Response(e, np.ones_like(e), np.zeros((draws, 2 * count, 6)))
+    sigma, independent = response.serial(pairs, 2 * count)
+    plain = response.sigma(pairs, 2 * count)
+    # The sandwich estimator counts each pair twice.
+    actual = np.sqrt(2) * response.estimate().std()
+    assert 0.6 < np.median(sigma) / actual < 1.15
+    if correlation:
+        assert np.median(plain) < 0.4 * actual
+        assert np.median(independent) < 0.3 * 2 * count
+    else:
+        assert np.median(sigma / plain) == pytest.approx(1, abs=0.1)
+        assert np.median(independent) == pytest.approx(2 * count, rel=0.3)
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.1])

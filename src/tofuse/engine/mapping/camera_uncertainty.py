@@ -31,7 +31,11 @@ def pose_errors(
     are the uncertainty of corrections that were estimated from the views, and the gap of a loop
     that a better calibration would close.
     """
-    errors = [_credence(check) * np.array(check.moved), np.array(check.changed)]
+    credence_of_change = 1.0 if check.change_confirmed else _UNKNOWN
+    errors = [
+        _credence(check) * np.array(check.moved),
+        credence_of_change * np.array(check.changed),
+    ]
     if check.undetermined:
         errors.append(
             _UNKNOWN * calibration_check.TOLERANCES["focal"] * np.array(check.motion["focal"])

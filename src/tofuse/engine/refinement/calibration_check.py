@@ -109,8 +109,9 @@ class CalibrationCheck:
     moved
         Largest rms motion (m, rad) of the poses, after alignment, if one of the likely errors is
         corrected, or by the first estimate of one that the views determine.
-    changed
-        Rms motion (m, rad) of the poses by a change of the range, if that is significant.
+    changed, change_confirmed
+        Rms motion (m, rad) of the poses by a change of the range, if that is significant, and
+        whether it is no multipath, see `RangeChange`.
     significance
         Number of standard deviations that an estimate must exceed to be significant, see
         `significance_of`.
@@ -131,6 +132,7 @@ class CalibrationCheck:
     motion: dict[str, tuple[float, float]] = field(default_factory=dict)
     moved: tuple[float, float] = (0.0, 0.0)
     changed: tuple[float, float] = (0.0, 0.0)
+    change_confirmed: bool = True
     significance: float = SIGNIFICANT
     range_change: RangeChange | None = None
     contradicted: bool = False
@@ -216,7 +218,11 @@ def check_calibration(
         if (changed or first.change).is_significant:
             ratio = abs(changed.change / first.change.scale) if changed else 1.0
             m, rad = first.change_motion
-            without_error = replace(without_error, changed=(ratio * m, ratio * rad))
+            without_error = replace(
+                without_error,
+                changed=(ratio * m, ratio * rad),
+                change_confirmed=changed is None or changed.confirmed,
+            )
     likely = [name for name in first.determined if first.is_likely(name)]
     if not likely:
         return _check_by_loop(views, refined, first, without_error, options)

@@ -19,6 +19,7 @@ from tofuse.engine.stored_views import pair_equation_kernels as kernels
 # Significance of an error in standard deviations of a normal distribution.
 SIGNIFICANT = 4.0
 _SHARED = kernels.SOURCE_SCALE  # number of errors that all views share
+_MAX_CORRELATION = 0.97  # of errors of successive views
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +66,31 @@ class Response:
         # One degree of freedom is lost, as the estimate is that of the same views.
         scatter = np.sqrt((view_gradient**2).sum(0) * view_count / max(view_count - 1, 1))
         return np.asarray(scatter / np.maximum(self.information.sum(0), 1e-12), np.float64)
+
+    def serial(self, pairs: Intp, view_count: int) -> tuple[Float64, Float64]:
+        """Return standard deviations and effective numbers of views (K,) of profiles over time.
+
+        As `sigma` and `informative_views`, but for views whose errors resemble those of the views
+        before and after, as with multipath, which changes from room to room: with the
+        autocovariances up to a lag that follows from that of the next view (Newey and West 1987;
+        Andrews 1991, equation 6.2), which also reduces the number of independent views.
+        Arguments as of `sigma`; the views are in the order of time.
+        """
+        residual_gradient = self.gradient + self.information * self.estimate()
+        v = _by_view(residual_gradient, pairs, view_count)
+        variance = np.maximum((v**2).sum(0), 1e-24)
+        next_one = ((v[1:] * v[:-1]).sum(0) / variance).clip(0, _MAX_CORRELATION)
+        alpha = (2 * next_one / (1 - next_one**2)) ** 2
+        # Of white noise it is 1, the lag 0.
+        width = np.minimum(np.maximum(1.1447 * (alpha * view_count) ** (1 / 3), 1), view_count)
+        total = variance.copy()
+        for lag in range(1, view_count):
+            total += 2 * np.maximum(1 - lag / width, 0) * (v[lag:] * v[:-lag]).sum(0)
+        # One degree of freedom is lost, as the estimate is that of the same views.
+        scatter = np.sqrt(np.maximum(total, variance) * view_count / max(view_count - 1, 1))
+        sigma = scatter / np.maximum(self.information.sum(0), 1e-12)
+        independent = self.informative_views(pairs, view_count) * np.minimum(1.5 / width, 1)
+        return np.asarray(sigma, np.float64), np.asarray(independent, np.float64)
 
     def informative_views(self, pairs: Intp, view_count: int) -> Float64:
         """(K,) effective number of views that determine each error; arguments as of `sigma`."""

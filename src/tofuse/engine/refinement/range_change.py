@@ -48,12 +48,16 @@ class RangeChange:
         Index of the first view after the change; None if the range drifts.
     limit
         Number of standard deviations that a significant change exceeds.
+    confirmed
+        Whether the change is significant, too, if the errors of successive views resemble each
+        other. If not, it may be multipath, which differs from room to room.
     """
 
     change: float
     sigma: float
     frame: int | None
     limit: float
+    confirmed: bool = True
 
     @property
     def is_significant(self) -> bool:
@@ -62,8 +66,8 @@ class RangeChange:
 
     @property
     def is_large(self) -> bool:
-        """Whether it is significant, and beyond the tolerance of usual cameras."""
-        return self.is_significant and abs(self.change) > TOLERANCE
+        """Whether it is confirmed, and beyond the tolerance of usual cameras."""
+        return self.is_significant and self.confirmed and abs(self.change) > TOLERANCE
 
     def in_words(self) -> str:
         """Describe the change."""
@@ -169,9 +173,13 @@ def range_change(
         linearised = Linearised.of(scaled, poses, pairs, options, priors)
         found = linearised.response_to_scales(profile)
         step, sigma = float(found.estimate()[-1]), float(found.sigma(pairs, len(views))[-1])
+        serial_sigma, independent = (float(v[-1]) for v in found.serial(pairs, len(views)))
         scale += step
         poses = poses @ se3.exp(step * found.motion[-1])
         del scaled, linearised, found  # before the views are copied again
         if abs(step) < _CONVERGED * TOLERANCE:
             break
-    return RangeChange(1 / (1 + scale) - 1, sigma, likely.frame, likely.limit)
+    change = 1 / (1 + scale) - 1
+    serial_limit = significance_of(independent, tests=len(views))
+    confirmed = abs(change) > serial_limit * serial_sigma
+    return RangeChange(change, sigma, likely.frame, likely.limit, confirmed)
