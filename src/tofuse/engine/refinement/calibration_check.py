@@ -111,7 +111,7 @@ class CalibrationCheck:
         corrected, or by the first estimate of one that the views determine.
     changed, change_confirmed
         Rms motion (m, rad) of the poses by a change of the range, if that is significant, and
-        whether it is no multipath, see `RangeChange`.
+        whether it can't be multipath, see `RangeChange`.
     significance
         Number of standard deviations that an estimate must exceed to be significant, see
         `significance_of`.

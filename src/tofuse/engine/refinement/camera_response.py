@@ -61,11 +61,7 @@ class Response:
         view_count
             Number of views.
         """
-        residual_gradient = self.gradient + self.information * self.estimate()
-        view_gradient = _by_view(residual_gradient, pairs, view_count)
-        # One degree of freedom is lost, as the estimate is that of the same views.
-        scatter = np.sqrt((view_gradient**2).sum(0) * view_count / max(view_count - 1, 1))
-        return np.asarray(scatter / np.maximum(self.information.sum(0), 1e-12), np.float64)
+        return self._sigma((self._of_views(pairs, view_count) ** 2).sum(0), view_count)
 
     def serial(self, pairs: Intp, view_count: int) -> tuple[Float64, Float64]:
         """Return standard deviations and effective numbers of views (K,) of profiles over time.
@@ -76,21 +72,29 @@ class Response:
         Andrews 1991, equation 6.2), which also reduces the number of independent views.
         Arguments as of `sigma`; the views are in the order of time.
         """
-        residual_gradient = self.gradient + self.information * self.estimate()
-        v = _by_view(residual_gradient, pairs, view_count)
+        v = self._of_views(pairs, view_count)
         variance = np.maximum((v**2).sum(0), 1e-24)
         next_one = ((v[1:] * v[:-1]).sum(0) / variance).clip(0, _MAX_CORRELATION)
         alpha = (2 * next_one / (1 - next_one**2)) ** 2
-        # Of white noise it is 1, the lag 0.
+        # Weights decrease from 1 at lag 0 to 0 at this one; with white noise no lag counts.
         width = np.minimum(np.maximum(1.1447 * (alpha * view_count) ** (1 / 3), 1), view_count)
         total = variance.copy()
         for lag in range(1, view_count):
             total += 2 * np.maximum(1 - lag / width, 0) * (v[lag:] * v[:-lag]).sum(0)
-        # One degree of freedom is lost, as the estimate is that of the same views.
-        scatter = np.sqrt(np.maximum(total, variance) * view_count / max(view_count - 1, 1))
-        sigma = scatter / np.maximum(self.information.sum(0), 1e-12)
         independent = self.informative_views(pairs, view_count) * np.minimum(1.5 / width, 1)
-        return np.asarray(sigma, np.float64), np.asarray(independent, np.float64)
+        sigma = self._sigma(np.maximum(total, variance), view_count)
+        return sigma, np.asarray(independent, np.float64)
+
+    def _of_views(self, pairs: Intp, view_count: int) -> Float64:
+        """(N, K) gradients of the views at the estimates."""
+        residual_gradient = self.gradient + self.information * self.estimate()
+        return _by_view(residual_gradient, pairs, view_count)
+
+    def _sigma(self, variance: Float64, view_count: int) -> Float64:
+        """(K,) standard deviations, by the variances of the sums of the gradients."""
+        # One degree of freedom is lost, as the estimate is that of the same views.
+        scatter = np.sqrt(variance * view_count / max(view_count - 1, 1))
+        return np.asarray(scatter / np.maximum(self.information.sum(0), 1e-12), np.float64)
 
     def informative_views(self, pairs: Intp, view_count: int) -> Float64:
         """(K,) effective number of views that determine each error; arguments as of `sigma`."""
