@@ -12,6 +12,7 @@ from parsed_glb import parse
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion import atlas as atlas_module
+from tofuse.engine.fusion import texture as texture_module
 from tofuse.engine.fusion.atlas import MARGIN, unwrap
 from tofuse.engine.fusion.atlas_kernels import NO_TRIANGLE, draw_triangles
 from tofuse.engine.fusion.cloud import NO_COLOR
@@ -164,6 +165,17 @@ def test_texture_has_uniform_exposure() -> None:
     assert np.quantile(error, 0.99) < 4.0
     # With the original exposures, the best view alone would be off by 20 % and more.
     assert np.abs(pattern(at) * 1.3 - truth).mean() > 20
+
+
+def test_bands_leave_no_trace(monkeypatch) -> None:
+    mesh, views = sheet(30, 22, 0.05), [TextureView.of(look(T, 1.0)) for T in POSES]
+    monkeypatch.setattr(texture_module, "_BAND", 1024)
+    at_once = textured(mesh, views, POSES, 1024)
+    monkeypatch.setattr(texture_module, "_BAND", 7)
+    in_bands = textured(mesh, views, POSES, 1024)
+    assert at_once.image.shape[0] > 7 * 10
+    assert np.ptp(at_once.image) > 60  # it shows the pattern
+    np.testing.assert_array_equal(in_bands.image, at_once.image)
 
 
 def test_amplitude_becomes_albedo_and_grey() -> None:
