@@ -48,6 +48,20 @@ def test_normal_equations_are_those_of_the_jacobian(rng):
     np.testing.assert_allclose(g, (JtW @ e[..., None])[..., 0], rtol=1e-9, atol=1e-10 * scale)
 
 
+def test_jacobian_is_derivative_of_log(rng):
+    xi = rng.normal(size=(5, 6))
+    J = np.zeros((5, 6, 6))
+    for axis in range(6):
+        d = np.zeros(6)
+        d[axis] = 1e-6
+        up, down = (se3.log(se3.exp(xi) @ se3.exp(sign * d)) for sign in (1, -1))
+        J[..., axis] = (up - down) / 2e-6
+    H, g = sparse.equations(xi, np.tile(np.eye(6), (5, 1, 1)))
+    Jt = np.swapaxes(J, 1, 2)
+    np.testing.assert_allclose(H, Jt @ J, rtol=1e-8, atol=1e-7)
+    np.testing.assert_allclose(g, (Jt @ xi[..., None])[..., 0], rtol=1e-8, atol=1e-7)
+
+
 def test_errors_are_logarithms(rng):
     expected = twists(rng, ANGLES)
     count = len(expected)

@@ -134,8 +134,6 @@ def weigh_points(
     tolerance_ratio: float,
     weights: Float32,
     pixels: Float32,
-    start: int,
-    end: int,
 ) -> None:
     """Weigh how well a view shows points: near, perpendicular, and far from edges.
 
@@ -151,13 +149,11 @@ def weigh_points(
     weights, pixels
         (N,) and (N, 2) written where the point is visible: its weight, column and row in the depth
         image.
-    start, end
-        Range of points.
     """
     z, reach, lookup, frame = view
     height, width = z.shape
     R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
-    for n in range(start, end):
+    for n in range(len(points)):
         x = R[0, 0] * points[n, 0] + R[0, 1] * points[n, 1] + R[0, 2] * points[n, 2] + t[0]
         y = R[1, 0] * points[n, 0] + R[1, 1] * points[n, 1] + R[1, 2] * points[n, 2] + t[1]
         d = R[2, 0] * points[n, 0] + R[2, 1] * points[n, 1] + R[2, 2] * points[n, 2] + t[2]
@@ -202,8 +198,6 @@ def paint_triangles(
     view: Pictures,
     T_camera_world: Float64,
     canvas: Canvas,
-    start: int,
-    end: int,
 ) -> None:
     """Paint what one view shows of some triangles.
 
@@ -219,16 +213,13 @@ def paint_triangles(
         The view and its (4, 4) pose.
     canvas
         Added to.
-    start, end
-        Range of `triangles`.
     """
     fine, coarse, scales, gain, lookup, frame = view
     triangle, barycentric, total, sums, best, detail = canvas
     height, width = triangle.shape
     R, t = T_camera_world[:3, :3], T_camera_world[:3, 3]
     color = np.empty((2, 3), np.float32)
-    for k in range(start, end):
-        m = triangles[k]
+    for m in triangles:
         a, b, c = faces[m]
         wa, wb, wc = weights[a], weights[b], weights[c]
         left = max(int(corners[m, :, 0].min()) - 2, 0)
@@ -274,9 +265,7 @@ def paint_triangles(
 
 
 @kernel
-def finish(
-    canvas: Canvas, faces: Int32, unseen: Bool, base: UInt8, image: UInt8, start: int, end: int
-) -> None:
+def finish(canvas: Canvas, faces: Int32, unseen: Bool, base: UInt8, image: UInt8) -> None:
     """Write the colours of the texels: painted ones fade into those of vertices that are unseen.
 
     Parameters
@@ -287,11 +276,9 @@ def finish(
         (M, 3) rows of the vertices (N,), whether no view shows them, and their colours (N, 3).
     image
         (H, W, 3) written where there is a triangle.
-    start, end
-        Range of rows.
     """
     triangle, barycentric, total, sums, _, detail = canvas
-    for row in range(start, end):
+    for row in range(triangle.shape[0]):
         for column in range(triangle.shape[1]):
             m = triangle[row, column]
             if m < 0:

@@ -271,8 +271,7 @@ class _Seen:
             view = views[k]
             tested = SeenBy(view.z, view.reach, view.projection.lookup, view.projection.frame)
             limits = (TOLERANCE_M, TOLERANCE_FRACTION)
-            scene = (points, normals, tested, T_camera_world, *limits, weights[k], pixels[k])
-            weigh_points(*scene, 0, len(points))
+            weigh_points(points, normals, tested, T_camera_world, *limits, weights[k], pixels[k])
 
         run_all([partial(weigh, k, T) for k, T in enumerate(se3.inverse(poses))])
         return cls(views, poses, weights, pixels)
@@ -377,8 +376,8 @@ def _painted(mesh: Mesh, seen: _Seen, gains: Float64, candidates: Int32, atlas: 
         for k, picture in enumerate(of_views):
             triangles = (order[bounds[k] : bounds[k + 1]] // views.shape[1]).astype(np.int32)
             scene = (corners, faces, points, seen.weights[k], picture, T_camera_world[k], canvas)
-            paint_triangles(triangles, *scene, 0, len(triangles))
-        finish(canvas, faces, unseen, base, image[first:last], 0, last - first)
+            paint_triangles(triangles, *scene)
+        finish(canvas, faces, unseen, base, image[first:last])
         owned[first:last] = owner != NO_TRIANGLE
 
     run_chunks(paint, atlas.size, -(-atlas.size // _BAND))
