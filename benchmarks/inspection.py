@@ -201,9 +201,10 @@ def frozen(frames: Frames, k: int) -> Frames:
     return [replace(frames[k - (k == 2)], timestamp=f.timestamp) for k, f in enumerate(frames)]
 
 
-def wrapped(frames: Frames, k: int) -> Frames:
-    """Depth of a camera with an ambiguity range that a quarter of the image exceeds."""
-    period = float(np.percentile(np.concatenate([f.radial_range[f.valid] for f in frames]), 75))
+def wrapped(frames: Frames, percent: float) -> Frames:
+    """Depth of a camera with an ambiguity range that a percentage of the pixels exceeds."""
+    ranges = np.concatenate([f.radial_range[f.valid] for f in frames])
+    period = float(np.percentile(ranges, 100 - percent))
     out = []
     for f in frames:
         r = f.radial_range
@@ -251,7 +252,8 @@ FAULTS: dict[str, tuple[str, Callable[[Frames, int], Frames], str]] = {
     "timestamps repeated": ("clean", times(repeated), "time_repeated"),
     "frames missing": ("clean", times(gap), "frames_missing"),
     "images repeated": ("clean", frozen, "frames_repeated"),
-    "phase wrap": ("clean", wrapped, "phase_wrap"),
+    "phase wrap of a quarter": ("clean", lambda f, k: wrapped(f, 25), "some_phase_wrap"),
+    "phase wrap of three quarters": ("clean", lambda f, k: wrapped(f, 75), "phase_wrap"),
     "saturation": ("saturation", as_it_is, "saturated"),
     "depth smoothed across edges": ("furnished", smoothed, "flying_pixels"),
     "shift of 0.3 of the view per frame": ("fast", as_it_is, "fast_motion"),

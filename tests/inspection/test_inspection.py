@@ -27,6 +27,8 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.quality.pose_accuracy import Accuracy, WorstFrame
 from tofuse.engine.results.types import Reason, SelfCalibration
 from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.record import plan
 from wrapped_depth import wrapping
 
 CAMERA = Pinhole(40, 30, 40.0, 40.0, 19.5, 14.5)
@@ -264,6 +266,23 @@ def test_faults_are_detected(code, few, turn) -> None:
     assert all(np.isfinite(v) for v in named.evidence.values())
     assert found.severe == any(f.severity == "severe" for f in found.findings)
     assert str(named) in found.warnings
+
+
+@pytest.mark.nightly_part
+@pytest.mark.parametrize(
+    ("scene", "every", "code"), [("hall", 90, "phase_wrap"), ("flat", 60, "some_phase_wrap")]
+)
+def test_wraps_are_severe_where_they_may_be_the_majority(scene, every, code) -> None:
+    """Most of a hall of 8 x 8 m is beyond 5 m, and of a flat only what the doors let through."""
+    made = plan(scene, every=every, seed=3, effects=Effects().without("multipath"))
+    frames = [rendered.frame for rendered in made.frames(None)]
+    (found,) = (f for f in tofuse.inspect(of(frames), quick=True).findings if "wrap" in f.code)
+    assert found.code == code
+    assert (found.evidence["wrapped_fraction"] > 0.5) == (code == "phase_wrap")
+    # Without amplitude nothing tells the majority, and seams are left.
+    dark = [replace(frame, amplitude_image=None) for frame in frames]
+    assert "phase_wrap" in codes(dark)
+    assert "some_phase_wrap" not in codes(dark)
 
 
 def test_swapped_bytes_are_detected() -> None:

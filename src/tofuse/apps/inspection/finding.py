@@ -22,8 +22,8 @@ CODES: dict[str, Severity] = {
     # The effect of the last two is measured by tracking, and decides the verdict.
     **dict.fromkeys(
         ("time_unit", "time_repeated", "frames_missing", "frames_repeated", "saturated",
-         "few_valid", "flying_pixels", "little_overlap", "fast_motion", "poses_misread",
-         "depth_scale"),
+         "few_valid", "flying_pixels", "some_phase_wrap", "poses_misread", "depth_scale",
+         "little_overlap", "fast_motion"),
         "warning"),
     **dict.fromkeys(("static", "wall_only"), "note"),
 }  # fmt: skip

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from tofuse.apps.inspection.finding import Finding
 from tofuse.apps.inspection.sample import Sample
 from tofuse.engine.arrays import Bool, Float32
 from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
-from tofuse.engine.sensor import on_surface
+from tofuse.engine.sensor import Unwrap, on_surface
 
 # Range of typical distances of ToF cameras, m.
 _MIN_DISTANCE_M, _MAX_DISTANCE_M = 0.15, 12.0
@@ -29,6 +30,9 @@ _MAX_SEAM_FRACTION = 0.003
 # median, are wrapped.
 _DARK, _NEAR = 0.12, 0.5
 _MAX_DARK_FRACTION = 0.08
+# Robust tracking follows the majority of the pixels: the wrapped ones must be fewer in this fraction
+# of the views.
+_MAX_WRAPPED, _MINORITY_VIEWS = 0.5, 0.9
 # Largest fraction of a count by which stored depth differs from a whole number; and ratio of the
 # mean differences of neighbours with swapped bytes to those as read, below which they are swapped.
 _MAX_FRACTION, _MIN_SWAPPED_RATIO = 0.05, 0.2
@@ -196,38 +200,88 @@ def check_wrap(sample: Sample) -> Iterator[Finding]:
 
     A surface that continues beyond the camera's period reappears at range 0, so far and near touch,
     and returns less light than its wrapped range implies: its apparent albedo, amplitude times the
-    squared range, is small. Pixels with too weak a signal have random ranges and are dark as well:
-    only pixels on a surface with their neighbours count.
+    squared range, is small.
+
+    Robust tracking follows the majority of the pixels, so it matters whether those are wrapped.
+    That is known if unwrapping leaves neither seams nor dark pixels.
     """
     period = sample.period_m
     if period is None:
         return
-    seams = dark = valid = with_albedo = 0
-    for frame in sample.images:
-        r = frame.radial_range
-        surface = on_surface(np.where(frame.valid, r, np.float32(0)), period)
-        late, early = surface & (r > _LATE * period), surface & (r < _EARLY * period)
-        for a, b in ((np.s_[:, :-2], np.s_[:, 2:]), (np.s_[:-2], np.s_[2:])):
-            seams += int(np.count_nonzero((late[a] & early[b]) | (early[a] & late[b])))
-        valid += len(frame)
-        amplitude = frame.amplitude_image
-        if amplitude is None:
-            continue
-        usable = frame.valid & (amplitude > 0) & (amplitude < SATURATED_AMPLITUDE)
-        albedo = amplitude if frame.amplitude_kind == "range_compensated" else amplitude * r * r
-        with_albedo += int(np.count_nonzero(usable))
-        if usable.any():
-            near = usable & surface & (r < _NEAR * period)
-            is_dark = albedo < _DARK * float(np.median(albedo[usable]))
-            dark += int(np.count_nonzero(near & is_dark))
-    seam_fraction, dark_fraction = seams / max(valid, 1), dark / max(with_albedo, 1)
-    if seam_fraction > _MAX_SEAM_FRACTION or dark_fraction > _MAX_DARK_FRACTION:
-        yield Finding(
-            "phase_wrap",
-            f"Phase wrapping: surfaces beyond the ambiguity range ({period:.3g} m) appear too "
-            f"close: {seam_fraction:.2%} of the pixels are at seams from far to near, and "
-            f"{dark_fraction:.1%} are near but {1 / _DARK:.0f} times darker than the rest.",
-            "Use --unwrap (it needs the amplitude), record with a lower modulation frequency, or "
-            "drop weak pixels by an amplitude filter.",
-            {"seam_fraction": seam_fraction, "dark_fraction": dark_fraction, "period_m": period},
-        )
+    signs = _WrapSigns.of(sample.images, period)
+    if not signs:
+        return
+    unwrap = Unwrap(period_m=period).fit(sample.images)
+    unwrapped = [image for f in sample.images if isinstance(image := unwrap.apply(f), RangeFrame)]
+    share = _wrapped_share(sample.images, unwrapped, period)
+    is_minority = share < _MAX_WRAPPED and not _WrapSigns.of(unwrapped, period)
+    effect = (
+        "Most of what the views show is nearer, and their poses follow that."
+        if is_minority
+        else "They may be most of what a view shows, and mislead its pose."
+    )
+    yield Finding(
+        "some_phase_wrap" if is_minority else "phase_wrap",
+        f"Phase wrapping: surfaces beyond the ambiguity range ({period:.3g} m) appear too "
+        f"close: {signs.seams:.2%} of the pixels are at seams from far to near, and "
+        f"{signs.dark:.1%} are near but {1 / _DARK:.0f} times darker than the rest. {effect}",
+        "Use --unwrap (it needs the amplitude), record with a lower modulation frequency, or "
+        "drop weak pixels by an amplitude filter.",
+        {
+            "seam_fraction": signs.seams,
+            "dark_fraction": signs.dark,
+            "period_m": period,
+            "wrapped_fraction": share,
+        },
+    )
+
+
+@dataclass(frozen=True)
+class _WrapSigns:
+    """Fractions of the pixels at seams, and of those that are near but dark; true if many."""
+
+    seams: float
+    dark: float
+
+    @classmethod
+    def of(cls, images: Sequence[RangeFrame], period: float) -> Self:
+        """Count them on surfaces: pixels with too weak a signal have random ranges, and are dark."""
+        seams = dark = valid = with_albedo = 0
+        for frame in images:
+            r = frame.radial_range
+            surface = _surface(frame, period)
+            late, early = surface & (r > _LATE * period), surface & (r < _EARLY * period)
+            for a, b in ((np.s_[:, :-2], np.s_[:, 2:]), (np.s_[:-2], np.s_[2:])):
+                seams += int(np.count_nonzero((late[a] & early[b]) | (early[a] & late[b])))
+            valid += len(frame)
+            amplitude = frame.amplitude_image
+            if amplitude is None:
+                continue
+            usable = frame.valid & (amplitude > 0) & (amplitude < SATURATED_AMPLITUDE)
+            compensated = frame.amplitude_kind == "range_compensated"
+            albedo = amplitude if compensated else amplitude * r * r
+            with_albedo += int(np.count_nonzero(usable))
+            if usable.any():
+                near = usable & surface & (r < _NEAR * period)
+                is_dark = albedo < _DARK * float(np.median(albedo[usable]))
+                dark += int(np.count_nonzero(near & is_dark))
+        return cls(seams / max(valid, 1), dark / max(with_albedo, 1))
+
+    def __bool__(self) -> bool:
+        return self.seams > _MAX_SEAM_FRACTION or self.dark > _MAX_DARK_FRACTION
+
+
+def _surface(frame: RangeFrame, period: float) -> Bool:
+    return on_surface(np.where(frame.valid, frame.radial_range, np.float32(0)), period)
+
+
+def _wrapped_share(
+    images: Sequence[RangeFrame], unwrapped: Sequence[RangeFrame], period: float
+) -> float:
+    """Return the fraction of wrapped surface that most images stay below."""
+    shares = [
+        float((after.depth > before.depth)[surface].mean())
+        for before, after in zip(images, unwrapped, strict=True)
+        if (surface := _surface(before, period)).any()
+    ]
+    return float(np.quantile(shares, _MINORITY_VIEWS)) if shares else 0.0
