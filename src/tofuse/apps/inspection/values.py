@@ -30,8 +30,8 @@ _MAX_SEAM_FRACTION = 0.003
 # median, are wrapped.
 _DARK, _NEAR = 0.12, 0.5
 _MAX_DARK_FRACTION = 0.08
-# Robust tracking follows the majority of the pixels: the wrapped ones must be fewer in this fraction
-# of the views.
+# Robust tracking follows the majority of the pixels: the wrapped ones must be fewer in this
+# fraction of the views.
 _MAX_WRAPPED, _MINORITY_VIEWS = 0.5, 0.9
 # Largest fraction of a count by which stored depth differs from a whole number; and ratio of the
 # mean differences of neighbours with swapped bytes to those as read, below which they are swapped.
@@ -245,7 +245,7 @@ class _WrapSigns:
 
     @classmethod
     def of(cls, images: Sequence[RangeFrame], period: float) -> Self:
-        """Count them on surfaces: pixels with too weak a signal have random ranges, and are dark."""
+        """Count them on surfaces: pixels with too weak a signal are dark, at random ranges."""
         seams = dark = valid = with_albedo = 0
         for frame in images:
             r = frame.radial_range
