@@ -22,6 +22,7 @@ def pair_equations(
             np.array([0]),
             np.array([len(points)]),
             np.array([surface.measures_range]),
+            surface.projection.lens,
         ),
         np.array([0]),
         *targets([surface], [0, 1], scale),

@@ -195,6 +195,7 @@ def test_pairs_of_target_have_equations_of_single_pairs(pair, known):
             ends[:-1],
             ends[1:],
             np.zeros(2, bool),
+            np.zeros(3, np.float32),
         ),
         np.array([1, 0]),
         *targets(views[1:], [0, 2]),

@@ -2,7 +2,8 @@
 
 A `Camera` is anything with `rays()` and `project()`; `MODELS` are the lenses that `camera.json`
 names, and a `RayTable` is any other. `depth_conversion` turns radial range into depth and points;
-`projection_kernels` project into a view inside kernels.
+`projection_kernels` project into a view inside kernels, and `lens_kernels` know
+its distortion.
 """
 
 from typing import TYPE_CHECKING
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.cameras import depth_conversion, projection_kernels
+    from tofuse.engine.cameras import depth_conversion, lens_kernels, projection_kernels
     from tofuse.engine.cameras.cameras import (
         DISTORTION_ORDER,
         MODELS,
@@ -26,5 +27,6 @@ if TYPE_CHECKING:
         scaled,
         unknown_rays,
     )
+    from tofuse.engine.cameras.lens import fitted_lens, moved_rays
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.cameras import Camera, Pinhole, RayTable, ray_lengths
+from tofuse.engine.cameras import Camera, Pinhole, RayTable, moved_rays, ray_lengths
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
@@ -128,15 +128,15 @@ class CameraErrors(Bounded, Correction):
     Attributes
     ----------
     focal
-        Relative correction of the ray coordinates: the true focal length is 1 / (1 + focal) of the
+        Relative correction of distorted rays: the true focal length is 1 / (1 + focal) of the
         stated one.
     offset_m
         Added to all ranges, m.
     center_x, center_y
-        Added to the ray coordinates x / z and y / z: by so many true focal lengths the true
+        Added to the x / z and y / z of distorted rays: by so many true focal lengths the true
         principal point is further left and up.
     distortion
-        Times the squared distance from the axis, a relative correction of the ray coordinates too.
+        Times the squared distance from the axis, a relative correction of the rays.
     focal_sigma, offset_sigma_m, center_x_sigma, center_y_sigma, distortion_sigma
         Standard deviations of these, which the stated accuracy of poses includes.
     """
@@ -199,13 +199,18 @@ class CameraErrors(Bounded, Correction):
 
     def camera(self, stated: Camera) -> Camera:
         """Return the true camera."""
-        if isinstance(stated, Pinhole) and not self.distortion:
+        if isinstance(stated, Pinhole):
             fx, fy = stated.fx / (1 + self.focal), stated.fy / (1 + self.focal)
             cx, cy = stated.cx - self.center_x * fx, stated.cy - self.center_y * fy
-            return replace(stated, fx=fx, fy=fy, cx=cx, cy=cy)
-        rays = np.asarray(stated.rays(), np.float64)
-        scale = 1 + self.focal + self.distortion * (rays**2).sum(-1, keepdims=True)
-        return RayTable((rays * scale + [self.center_x, self.center_y]).astype(np.float32))
+            camera: Camera = replace(stated, fx=fx, fy=fy, cx=cx, cy=cy)
+        else:
+            rays = moved_rays(stated.rays(), self.focal, (self.center_x, self.center_y))
+            camera = RayTable(rays)
+        if not self.distortion:
+            return camera
+        squares = (np.asarray(stated.rays(), np.float64) ** 2).sum(-1, keepdims=True)
+        rays = camera.rays() + self.distortion * squares * stated.rays()
+        return RayTable(rays.astype(np.float32))
 
 
 @dataclass(eq=False)

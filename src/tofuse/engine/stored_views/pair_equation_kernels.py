@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int64
-from tofuse.engine.cameras import projection_kernels
+from tofuse.engine.cameras import lens_kernels, projection_kernels
 from tofuse.engine.compute import kernel
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.views import residual_kernels as residual
@@ -28,9 +28,9 @@ from tofuse.engine.views import residual_kernels as residual
 # Camera errors, in the order of the unknowns.
 OFFSET = 0  # to be added to the range, m
 SCALE = 1  # relative, to be added to the depth
-FOCAL = 2  # relative, to be added to the ray coordinates; measured depth is kept, z or radial
-CENTER_X = 3  # to be added to the ray coordinate x / z: principal point over focal length
-CENTER_Y = 4  # to be added to y / z
+FOCAL = 2  # relative, to be added to distorted rays; measured depth is kept, z or radial
+CENTER_X = 3  # to be added to the x / z of distorted rays: principal point over focal length
+CENTER_Y = 4  # to be added to their y / z
 DISTORTION = 5  # relative, times x^2 + y^2 of the ray coordinates, to be added to these
 SOURCE_SCALE = 6  # as SCALE, but of the source view alone: to be estimated, not assumed
 ERRORS = 7
@@ -85,6 +85,8 @@ class CameraErrors(NamedTuple):
         Whether the cameras measure radial range, not z.
     target_scale
         By which the depth in the target image is multiplied.
+    lens
+        (3,) as of `SourcePoints`.
     """
 
     errors: Float64
@@ -92,6 +94,7 @@ class CameraErrors(NamedTuple):
     radial_source: bool
     radial_target: bool
     target_scale: float
+    lens: Float32
 
 
 class Scratch(NamedTuple):
@@ -127,6 +130,8 @@ class SourcePoints(NamedTuple):
         (N,) first row of the points of each view, and the row after the last.
     measures_range
         (N,) whether the camera of each view measures radial range, not z.
+    lens
+        (3,) distortion of the lens of all views, see `cameras.fitted_lens`.
     """
 
     points: Float32
@@ -134,6 +139,7 @@ class SourcePoints(NamedTuple):
     begin: Int64
     end: Int64
     measures_range: Bool
+    lens: Float32
 
 
 class PairResiduals(NamedTuple):
@@ -229,6 +235,7 @@ def target_equations(
                 sources.measures_range[view],
                 targets.measures_range[t],
                 targets.scale[t],
+                sources.lens,
             )
             _pair_equations(
                 sources.points[begin:end],
@@ -256,7 +263,7 @@ def _pair_equations(
     sums: Float64,
 ) -> None:
     """Add those of one pair, vectorised in blocks as in `alignment`."""
-    errors, estimated, radial_source, radial_target, target_scale = camera
+    errors, estimated, radial_source, radial_target, target_scale, lens = camera
     has_errors = (errors != 0).any()
     errors32 = errors.astype(np.float32)
     exposure, scale_g, scale_p, inflation, robust, min_cosine = residuals
@@ -272,10 +279,10 @@ def _pair_equations(
                 residual.POINT * residual.LANES : (residual.POINT + 3) * residual.LANES
             ]
         if has_errors:
-            _correct_points(block, errors32, radial_source)
+            _correct_points(block, errors32, lens, radial_source)
         residual.transform_block(block, T)
         if has_errors:
-            _distort_projection(block, errors32, radial_target)
+            _distort_projection(block, errors32, lens, radial_target)
         residual.project_block(block, count, image, lookup, lookup_frame)
         if target_scale != 1:
             _scale_planes(block, target_scale)
@@ -290,14 +297,14 @@ def _pair_equations(
             _add_patches(sums, block, patches[first : first + count])
         residual.add_products(total, block, 8)
         if len(estimated) > 0:
-            _respond_to_errors(block, T, radial_source, radial_target, True)
+            _respond_to_errors(block, T, lens, radial_source, radial_target, True)
             _add_error_products(error_total, block, estimated)
         _add_support(total[_SUPPORT], block, residual.WEIGHT_G)
         if scale_p > 0:
             residual.compare_albedos(block, T, exposure, scale_p, robust)
             residual.add_products(total, block, 8)
             if len(estimated) > 0:
-                _respond_to_errors(block, T, radial_source, radial_target, False)
+                _respond_to_errors(block, T, lens, radial_source, radial_target, False)
                 _add_error_products(error_total, block, estimated)
             _add_support(total[_SUPPORT], block, residual.WEIGHT_P)
         for statistic in (
@@ -346,14 +353,20 @@ def _product(p: int, o: int) -> int:
 
 @kernel
 def _respond_to_errors(
-    block: Float32, T: Float64, radial_source: bool, radial_target: bool, is_distance: bool
+    block: Float32,
+    T: Float64,
+    lens: Float32,
+    radial_source: bool,
+    radial_target: bool,
+    is_distance: bool,
 ) -> None:
     """Write the Jacobians of a block's residuals with respect to the errors of the camera.
 
     The displacement b(p) of a point by an error of size 1 is along p for those of the range; errors
-    of the intrinsics move it sideways, and along p so that the measured depth is kept. The same
-    mean of both views' normals or gradients is used for source and target: otherwise the difference
-    between these, which the pose cannot explain, would be attributed to the errors.
+    of the intrinsics move it sideways, by the slope of the lens's distortion, and along p so that
+    the measured depth is kept. The same mean of both views' normals or gradients is used for source
+    and target: otherwise the difference between these, which the pose cannot explain, would be
+    attributed to the errors.
     """
     r00, r01, r02 = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2])
     r10, r11, r12 = np.float32(T[1, 0]), np.float32(T[1, 1]), np.float32(T[1, 2])
@@ -381,23 +394,30 @@ def _respond_to_errors(
         along_p = m0 * px + m1 * py + m2 * pz
         along_q = n0 * qx + n1 * qy + n2 * qz
         kept_p, kept_q = radial_p * along_p / p2, radial_q * along_q / q2
-        focal_p = m0 * px + m1 * py - lateral_p * kept_p
-        focal_q = n0 * qx + n1 * qy - lateral_q * kept_q
         rho2_p = lateral_p / max(pz * pz, tiny)
         rho2_q = lateral_q / max(qz * qz, tiny)
+        bend_p, bend_q = lens_kernels.bend(rho2_p, lens), lens_kernels.bend(rho2_q, lens)
+        # Lengthening the distorted ray lengthens the ray itself by this factor.
+        longer_p, longer_q = one - bend_p * rho2_p, one - bend_q * rho2_q
+        across_p, across_q = m0 * px + m1 * py, n0 * qx + n1 * qy
+        scaled_p, scaled_q = across_p - lateral_p * kept_p, across_q - lateral_q * kept_q
+        steep_p = bend_p * across_p / max(pz * pz, tiny) + longer_p * kept_p
+        steep_q = bend_q * across_q / max(qz * qz, tiny) + longer_q * kept_q
+        center_p = pz / lens_kernels.distortion(rho2_p, lens)
+        center_q = qz / lens_kernels.distortion(rho2_q, lens)
         block[(_RESPONSE + OFFSET) * residual.LANES + k] = along_p / np.sqrt(
             p2
         ) - range_q * along_q / np.sqrt(q2)
         block[(_RESPONSE + SCALE) * residual.LANES + k] = along_p - range_q * along_q
         block[(_RESPONSE + SOURCE_SCALE) * residual.LANES + k] = along_p
-        block[(_RESPONSE + FOCAL) * residual.LANES + k] = focal_p - focal_q
-        block[(_RESPONSE + CENTER_X) * residual.LANES + k] = pz * (m0 - px * kept_p) - qz * (
-            n0 - qx * kept_q
-        )
-        block[(_RESPONSE + CENTER_Y) * residual.LANES + k] = pz * (m1 - py * kept_p) - qz * (
-            n1 - qy * kept_q
-        )
-        block[(_RESPONSE + DISTORTION) * residual.LANES + k] = rho2_p * focal_p - rho2_q * focal_q
+        block[(_RESPONSE + FOCAL) * residual.LANES + k] = longer_p * scaled_p - longer_q * scaled_q
+        block[(_RESPONSE + CENTER_X) * residual.LANES + k] = center_p * (
+            m0 - px * steep_p
+        ) - center_q * (n0 - qx * steep_q)
+        block[(_RESPONSE + CENTER_Y) * residual.LANES + k] = center_p * (
+            m1 - py * steep_p
+        ) - center_q * (n1 - qy * steep_q)
+        block[(_RESPONSE + DISTORTION) * residual.LANES + k] = rho2_p * scaled_p - rho2_q * scaled_q
 
 
 @kernel
@@ -420,57 +440,59 @@ def _add_error_products(total: Float32, block: Float32, estimated: Int64) -> Non
 
 
 @kernel
-def _correct_points(block: Float32, errors: Float32, radial: bool) -> None:
+def _correct_points(block: Float32, errors: Float32, lens: Float32, radial: bool) -> None:
     """Displace the points of a block by camera errors, see `_respond_to_errors`."""
     x = block[residual.POINT * residual.LANES : (residual.POINT + 1) * residual.LANES]
     y = block[(residual.POINT + 1) * residual.LANES : (residual.POINT + 2) * residual.LANES]
     z = block[(residual.POINT + 2) * residual.LANES : (residual.POINT + 3) * residual.LANES]
-    one, zero, tiny = np.float32(1), np.float32(0), np.float32(_EPSILON)
-    offset, scale = errors[OFFSET], errors[SCALE]
-    focal, distortion = errors[FOCAL], errors[DISTORTION]
+    one, tiny = np.float32(1), np.float32(_EPSILON)
+    offset, scale = errors[OFFSET], one + errors[SCALE]
+    focal, distortion = one + errors[FOCAL], errors[DISTORTION]
     center_x, center_y = errors[CENTER_X], errors[CENTER_Y]
     for k in range(residual.LANES):
-        lateral2 = x[k] * x[k] + y[k] * y[k]
-        z2 = z[k] * z[k]
-        r2 = max(lateral2 + z2, tiny)  # columns without a point may be 0
-        ray_scale_error = focal + distortion * lateral2 / max(z2, tiny)
-        center_term = center_x * x[k] + center_y * y[k]
-        shortening = (ray_scale_error * lateral2 + center_term * z[k]) / r2 if radial else zero
-        depth_scale = one + offset / np.sqrt(r2) + scale - shortening
-        x[k] = x[k] * (depth_scale + ray_scale_error) + center_x * z[k]
-        y[k] = y[k] * (depth_scale + ray_scale_error) + center_y * z[k]
-        z[k] *= depth_scale
+        nonzero = max(z[k], tiny)  # columns without a point may be 0
+        xn, yn = x[k] / nonzero, y[k] / nonzero
+        rho2 = xn * xn + yn * yn
+        length = np.sqrt(rho2 + one)
+        factor = focal * lens_kernels.distortion(rho2, lens)
+        # The pixel sees another ray, and along it what it measured: z or radial range.
+        ray_x, ray_y = lens_kernels.undistorted(
+            factor * xn + center_x, factor * yn + center_y, xn, yn, lens
+        )
+        ray_x += distortion * rho2 * xn
+        ray_y += distortion * rho2 * yn
+        shorter = length / np.sqrt(ray_x * ray_x + ray_y * ray_y + one)
+        depth = (z[k] * scale + offset / length) * (shorter if radial else one)
+        x[k], y[k], z[k] = ray_x * depth, ray_y * depth, depth
 
 
 @kernel
-def _distort_projection(block: Float32, errors: Float32, radial: bool) -> None:
+def _distort_projection(block: Float32, errors: Float32, lens: Float32, radial: bool) -> None:
     """Move the transformed points of a block to where the erroneous target would measure them.
 
-    This is the inverse of `_correct_points`, except for terms of second order by a distortion or by
-    an error of a radial range.
+    This is the inverse of `_correct_points`, except for terms of second order by a distortion.
     """
     xn = block[residual.XN * residual.LANES : (residual.XN + 1) * residual.LANES]
     yn = block[residual.YN * residual.LANES : (residual.YN + 1) * residual.LANES]
     z = block[residual.Z * residual.LANES : (residual.Z + 1) * residual.LANES]
-    one, zero = np.float32(1), np.float32(0)
-    offset, scale = errors[OFFSET], errors[SCALE]
-    focal, distortion = errors[FOCAL], errors[DISTORTION]
+    one = np.float32(1)
+    offset, scale = errors[OFFSET], one + errors[SCALE]
+    focal, distortion = one + errors[FOCAL], errors[DISTORTION]
     center_x, center_y = errors[CENTER_X], errors[CENTER_Y]
     for k in range(residual.LANES):
         # Only where the point is projected; no branch, so that the loop is vectorised.
         is_projected = z[k] > np.float32(projection_kernels.MIN_DEPTH)
-        range_per_z = np.sqrt(xn[k] * xn[k] + yn[k] * yn[k] + one)
-        x, y = xn[k] - center_x, yn[k] - center_y
-        ray_scale = one + focal + distortion * (x * x + y * y)
-        x /= ray_scale
-        y /= ray_scale
-        lateral2 = x * x + y * y
-        center_term = center_x * x + center_y * y
-        stretched = (ray_scale - one) * lateral2 + center_term
-        shortening = stretched / (lateral2 + one) if radial else zero
-        depth = (z[k] - offset / range_per_z) / (one + scale - shortening)
-        xn[k] = x if is_projected else xn[k]
-        yn[k] = y if is_projected else yn[k]
+        length = np.sqrt(xn[k] * xn[k] + yn[k] * yn[k] + one)
+        smaller = one + distortion * (xn[k] * xn[k] + yn[k] * yn[k])
+        x, y = xn[k] / smaller, yn[k] / smaller
+        factor = lens_kernels.distortion(x * x + y * y, lens)
+        ray_x, ray_y = lens_kernels.undistorted(
+            (factor * x - center_x) / focal, (factor * y - center_y) / focal, x, y, lens
+        )
+        longer = length / np.sqrt(ray_x * ray_x + ray_y * ray_y + one)
+        depth = (z[k] - offset / length) / scale * (longer if radial else one)
+        xn[k] = ray_x if is_projected else xn[k]
+        yn[k] = ray_y if is_projected else yn[k]
         z[k] = depth if is_projected else z[k]
 
 

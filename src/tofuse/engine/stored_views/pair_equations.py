@@ -215,6 +215,8 @@ def _sources(views: Sequence[SampledView], *, by_patch: bool) -> kernels.SourceP
         offsets[row_of_view],
         offsets[row_of_view + 1],
         np.array([v.measures_range for v in views], np.bool_),
+        # Views of one recording come from one camera.
+        views[0].projection.lens if views else np.zeros(3, np.float32),
     )
 
 

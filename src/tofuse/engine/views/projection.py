@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64
-from tofuse.engine.cameras import Camera
+from tofuse.engine.cameras import Camera, fitted_lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +56,11 @@ class Projection:
     def pitch(self) -> float:
         """Typical difference of x/z between neighbouring pixels."""
         return float(np.nanmedian(np.abs(np.diff(self.rays[..., 0], axis=1))))
+
+    @cached_property
+    def lens(self) -> Float32:
+        """(3,) radial distortion of the lens, see `cameras.fitted_lens`."""
+        return fitted_lens(self.rays)
 
     @classmethod
     def of(cls, camera: Camera, step: int, spacing: float = 4.0) -> Projection:
