@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.views.view_planes import FineScale, SurfaceOptions
 
 CAMERA = Pinhole(60, 48, 50.0, 50.0, 29.5, 23.5)
+# Its distortion bends as much as that of a strong lens, and is monotonic in the image.
+BARREL = BrownConrady(60, 48, 50.0, 50.0, 29.5, 23.5, k1=-0.3, k2=0.15)
 
 
 # No plane fit bridges the edges of the corner, so that the fits are exact. In images as coarse as
@@ -17,9 +19,11 @@ CAMERA = Pinhole(60, 48, 50.0, 50.0, 29.5, 23.5)
 SHARP = SurfaceOptions(radii=(4,), flatness=1e-5, fine_scale=FineScale(noise=0))
 
 
-def corner(T_world_camera: np.ndarray, *, offset: float = 0.0, waves: float = 1.0) -> RangeFrame:
+def corner(
+    T_world_camera: np.ndarray, *, offset: float = 0.0, waves: float = 1.0, camera: Pinhole = CAMERA
+) -> RangeFrame:
     """A corner of three walls with a pattern, seen by a camera whose range is short by `offset`."""
-    rays = np.concatenate([CAMERA.rays(), np.ones((48, 60, 1))], -1)
+    rays = np.concatenate([camera.rays(), np.ones((48, 60, 1))], -1)
     directions = rays @ T_world_camera[:3, :3].T
     origin = T_world_camera[:3, 3]
     depth = np.full((48, 60), np.inf)
@@ -38,7 +42,7 @@ def corner(T_world_camera: np.ndarray, *, offset: float = 0.0, waves: float = 1.
     return RangeFrame(
         index=0,
         timestamp=0.0,
-        camera=CAMERA,
+        camera=camera,
         depth=depth.astype(np.float32),
         depth_kind="z",
         amplitude_image=(1000 * light).astype(np.float32),

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from corner_views import SHARP, corner, unpack
+from corner_views import BARREL, CAMERA, SHARP, corner, unpack
 from pair_equations import KNOWN, pair_equations, targets
 from tofuse.engine.alignment.projective import points_of
 from tofuse.engine.cameras.cameras import RayTable
+from tofuse.engine.cameras.lens import UNDISTORTED
 from tofuse.engine.geometry import se3
 from tofuse.engine.stored_views import SampledView
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
@@ -40,13 +41,16 @@ def as_measured(frame, kind):
 @pytest.mark.parametrize("kind", ["z", "range"])
 @pytest.mark.parametrize(("scale_p", "tolerance"), [(0.0, 0.01), (0.5, 0.1)])
 @pytest.mark.parametrize("error", range(kernels.SOURCE_SCALE))
+@pytest.mark.parametrize("camera", [CAMERA, BARREL])
 def test_camera_error_changes_gradient_as_predicted_by_hessian(
-    pair, error, scale_p, tolerance, kind
+    pair, error, scale_p, tolerance, kind, camera
 ):
     """To first order g(e) = g(0) + H e: the mixed block is the slope of the gradient."""
     _, _, T = pair
     # A pattern so coarse that the pixel of a correspondence makes no difference.
-    source, target = (as_measured(corner(at, waves=0.1), kind) for at in (T, np.eye(4)))
+    source, target = (
+        as_measured(corner(at, waves=0.1, camera=camera), kind) for at in (T, np.eye(4))
+    )
     known = KNOWN.copy()
     known[error] = 0
     wide = (0.0, 1.0, scale_p, 0.3, 50.0, 0.5)  # so wide that the robust weights are 1
@@ -78,30 +82,35 @@ def test_large_error_has_no_effect_between_equal_views(error):
     assert same[7 + error, 7 + error] < 0.01 * turned[7 + error, 7 + error]
 
 
+INTRINSICS = [kernels.FOCAL, kernels.CENTER_X, kernels.CENTER_Y, kernels.DISTORTION]
+
+
+def stated(frame, kind, error, size):
+    """Return a frame whose stated intrinsics have an error."""
+    camera = frame.camera
+    wrong = camera
+    if error == kernels.FOCAL:
+        wrong = replace(camera, fx=camera.fx * (1 + size), fy=camera.fy * (1 + size))
+    if error == kernels.CENTER_X:
+        wrong = replace(camera, cx=camera.cx + size * camera.fx)
+    if error == kernels.CENTER_Y:
+        wrong = replace(camera, cy=camera.cy + size * camera.fy)
+    if error == kernels.DISTORTION:
+        rays = camera.rays()
+        wrong = RayTable(rays / (1 + size * (rays**2).sum(-1, keepdims=True)))
+    return replace(as_measured(frame, kind), camera=wrong)
+
+
 @pytest.mark.parametrize("kind", ["z", "range"])
-@pytest.mark.parametrize(
-    "error", [kernels.FOCAL, kernels.CENTER_X, kernels.CENTER_Y, kernels.DISTORTION]
-)
-def test_wrong_intrinsics_are_compensated(pair, kind, error):
+@pytest.mark.parametrize("camera", [CAMERA, BARREL])
+@pytest.mark.parametrize("error", INTRINSICS)
+def test_wrong_intrinsics_are_compensated(pair, kind, error, camera):
     """The measured quantity is kept: z, or the range along another ray."""
-    source, target, T = pair
+    *_, T = pair
+    source, target = (corner(at, camera=camera) for at in (T, np.eye(4)))
     errors = np.zeros(kernels.ERRORS)
     errors[error] = 0.03 if error == kernels.DISTORTION else 0.01
-
-    def stated(frame):
-        camera = frame.camera
-        fx, fy = (f * (1 + errors[kernels.FOCAL]) for f in (camera.fx, camera.fy))
-        cx, cy = (
-            camera.cx + errors[kernels.CENTER_X] * fx,
-            camera.cy + errors[kernels.CENTER_Y] * fy,
-        )
-        wrong = replace(camera, fx=fx, fy=fy, cx=cx, cy=cy)
-        if error == kernels.DISTORTION:
-            rays = camera.rays()
-            wrong = RayTable(rays / (1 + errors[error] * (rays**2).sum(-1, keepdims=True)))
-        return replace(as_measured(frame, kind), camera=wrong)
-
-    views = stated(source), stated(target)
+    views = [stated(frame, kind, error, errors[error]) for frame in (source, target)]
     known = KNOWN.copy()
     known[error] = 0
     plain = (0.0, 1.0, 0.1, 0.002, 4.0, 0.5)
@@ -113,6 +122,27 @@ def test_wrong_intrinsics_are_compensated(pair, kind, error):
     corrected = misfit(evaluate(*views, T, errors, known, plain))
     wrong = misfit(evaluate(*views, T, known=known, settings=plain))
     assert corrected - true < 0.3 * (wrong - true)
+
+
+@pytest.mark.parametrize("kind", ["z", "range"])
+@pytest.mark.parametrize("camera", [CAMERA, BARREL])
+@pytest.mark.parametrize("error", INTRINSICS)
+def test_response_is_that_of_wrong_intrinsics(pair, kind, error, camera):
+    """Stated intrinsics with an error change the gradient by the mixed block, behind any lens."""
+    *_, T = pair
+    frames = [corner(at, camera=camera) for at in (T, np.eye(4))]
+    known = KNOWN.copy()
+    known[error] = 0
+    plain = (0.0, 1.0, 0.0, 0.3, 50.0, 0.5)  # distances only, and robust weights of 1
+    size = 0.003
+    H, g = unpack(evaluate(*(as_measured(f, kind) for f in frames), T, known=known, settings=plain))
+    wrong = [stated(f, kind, error, size) for f in frames]
+    _, changed = unpack(evaluate(*wrong, T, known=known, settings=plain))
+    chosen = [*range(6), 7 + error]
+    scale = np.sqrt(np.diag(H)[chosen] * H[7 + error, 7 + error])
+    predicted = -size * H[:, 7 + error]
+    assert np.abs(predicted[chosen] / scale).max() > 0.5 * size
+    assert np.abs((changed - g - predicted)[chosen] / scale).max() < 0.1 * size
 
 
 @pytest.mark.parametrize("kind", ["z", "range"])
@@ -195,7 +225,7 @@ def test_pairs_of_target_have_equations_of_single_pairs(pair, known):
             ends[:-1],
             ends[1:],
             np.zeros(2, bool),
-            np.zeros(3, np.float32),
+            UNDISTORTED,
         ),
         np.array([1, 0]),
         *targets(views[1:], [0, 2]),

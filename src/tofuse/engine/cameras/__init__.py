@@ -27,6 +27,6 @@ if TYPE_CHECKING:
         scaled,
         unknown_rays,
     )
-    from tofuse.engine.cameras.lens import fitted_lens, moved_rays
+    from tofuse.engine.cameras.lens import UNDISTORTED, fitted_lens, moved_rays
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

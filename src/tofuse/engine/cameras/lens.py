@@ -11,19 +11,23 @@ import numpy as np
 from tofuse.engine.arrays import Float32
 from tofuse.engine.cameras import lens_kernels
 
-_COEFFICIENTS = 3
+# Coefficients of a lens without distortion.
+UNDISTORTED = np.array([1, 0, 0, 0], np.float32)
 # Approximate number of pixels along each side that the fit uses.
 _SAMPLED = 64
 # A lens that displaces pixels by a smaller fraction of their distance from the axis has none.
 _LEAST = 1e-4
+_CHECKED = 50  # distances at which the distortion is checked
 
 
 def fitted_lens(rays: Float32) -> Float32:
-    """Return the coefficients (3,) of the distortion ``1 + k1 r^2 + k2 r^4 + k3 r^6``.
+    """Return the coefficients c (4,) of the distortion by the squared distance s from the axis.
 
-    By least squares on the positions of the pixels: that of the ray (x, y) is the principal point
-    plus focal length times (x, y) times the distortion, where r^2 = x^2 + y^2 (Brown 1966). All are
-    0 without distortion, and where the fit is not monotonic in the image.
+    It multiplies the ray by ``(1 + c1 s + c2 s^2 + c3 s^3 + c4 s^4) / (1 + s)``, which is exact for
+    three radial coefficients (Brown 1966) and close for wide lenses, whose factor falls like the
+    angle over its tangent. By least squares on the positions of the pixels: the principal point
+    plus focal length times the distorted ray. `UNDISTORTED` where the factor is 1, and where the
+    fit is not monotonic in the image.
 
     Parameters
     ----------
@@ -34,19 +38,32 @@ def fitted_lens(rays: Float32) -> Float32:
     pixels = np.stack(np.mgrid[: rays.shape[0], : rays.shape[1]][::-1], -1)[steps]
     known = np.isfinite(rays[steps]).all(-1)
     xy, uv = rays[steps][known].astype(np.float64), pixels[known].astype(np.float64)
-    r2 = (xy**2).sum(-1)
-    powers = np.stack([r2**k for k in range(_COEFFICIENTS + 1)], -1)
-    fits = []
-    for axis in (0, 1):
-        columns = np.concatenate([xy[:, [axis]] * powers, np.ones((len(xy), 1))], 1)
-        found = np.linalg.lstsq(columns, uv[:, axis], rcond=None)[0]
-        fits.append(found[1:-1] / (found[0] or 1.0))
-    terms = powers[:, 1:] * np.mean(fits, axis=0)
-    slope = 1 + terms @ (2.0 * np.arange(1, _COEFFICIENTS + 1) + 1)
-    is_distorted = np.abs(terms.sum(-1)).max(initial=0.0) > _LEAST
-    if not is_distorted or slope.min(initial=1.0) <= lens_kernels.MIN_SLOPE:
-        return np.zeros(_COEFFICIENTS, np.float32)
-    return np.mean(fits, axis=0).astype(np.float32)
+    squares = (xy**2).sum(-1, keepdims=True)
+    powers = squares ** np.arange(len(UNDISTORTED) + 1) / (1 + squares)
+    # Both coordinates together: their focal lengths differ by the shape of the pixels.
+    shape = np.array([1.0, _aspect(rays)])
+    distorted = (xy * shape)[:, :, None] * powers[:, None]
+    ones = np.broadcast_to(np.eye(2), (len(xy), 2, 2))
+    columns = np.concatenate([distorted, ones], -1).reshape(2 * len(xy), -1)
+    found = np.linalg.lstsq(columns, uv.ravel(), rcond=None)[0]
+    lens = (found[1:-2] / (found[0] or 1.0)).astype(np.float32)
+    s = np.linspace(0, squares.max(initial=0.0), _CHECKED).astype(np.float32)
+    factor = np.array([lens_kernels.distortion(x, lens) for x in s])
+    is_monotonic = (np.diff(factor * np.sqrt(s)) > 0).all()
+    return lens if np.abs(factor - 1).max() > _LEAST and is_monotonic else UNDISTORTED
+
+
+def _aspect(rays: Float32) -> float:
+    """Return the ratio of the vertical to the horizontal focal length, by the middle of the image.
+
+    It is 1 if no neighbouring rays are known there.
+    """
+    middle = tuple(slice(n // 4, n - n // 4) for n in rays.shape[:2])
+    across, down = (np.diff(rays[..., k][middle], axis=1 - k) for k in (0, 1))
+    known = [d[np.isfinite(d)] for d in (across, down)]
+    if not all(len(d) and np.median(d) for d in known):
+        return 1.0
+    return float(np.median(known[0]) / np.median(known[1]))
 
 
 def moved_rays(rays: Float32, focal: float, center: tuple[float, float]) -> Float32:

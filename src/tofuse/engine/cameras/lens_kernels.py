@@ -15,7 +15,8 @@ _ITERATIONS = 3
 @kernel
 def distortion(r2: np.float32, lens: Float32) -> np.float32:
     """Return the factor by which the lens moves a ray at the squared distance r2 from the axis."""
-    return np.float32(1) + r2 * (lens[0] + r2 * (lens[1] + r2 * lens[2]))
+    one = np.float32(1)
+    return (one + r2 * (lens[0] + r2 * (lens[1] + r2 * (lens[2] + r2 * lens[3])))) / (one + r2)
 
 
 @kernel
@@ -24,9 +25,11 @@ def bend(r2: np.float32, lens: Float32) -> np.float32:
 
     ``(d - s x (x . d)) / f``, the inverse of the slope ``f + f' x x^T`` of the distortion.
     """
-    two, three = np.float32(2), np.float32(3)
-    slope = two * (lens[0] + r2 * (two * lens[1] + r2 * three * lens[2]))
-    return slope / max(distortion(r2, lens) + slope * r2, np.float32(MIN_SLOPE))
+    one, two, three, four = np.float32(1), np.float32(2), np.float32(3), np.float32(4)
+    above = lens[0] + r2 * (two * lens[1] + r2 * (three * lens[2] + r2 * four * lens[3]))
+    factor = distortion(r2, lens)
+    slope = two * (above - factor) / (one + r2)
+    return slope / max(factor + slope * r2, np.float32(MIN_SLOPE))
 
 
 @kernel

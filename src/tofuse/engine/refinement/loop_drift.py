@@ -104,8 +104,12 @@ class Gap:
         """Whether the estimated errors change it much without closing it, or widen it.
 
         Errors of the camera hardly change the gap of a short loop, which does not reveal them.
+        Noise leaves a gap beside true errors: their removal makes the square of the gap smaller by
+        that of the change, in the mean. Less than half of that speaks against them.
         """
-        changes = self._apparent_m(*self.change) > 0.5 * self._apparent_m(*self.before)
+        before, change = self._apparent_m(*self.before), self._apparent_m(*self.change)
+        is_smaller = before**2 - self.remaining_m**2 > 0.5 * change**2
+        changes = change > 0.5 * before and not is_smaller
         return self.significant and not self.closes and (changes or self.widens)
 
     @property
