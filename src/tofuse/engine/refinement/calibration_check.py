@@ -4,8 +4,8 @@ A wrong focal length or principal point, neglected lens distortion or a depth of
 trajectory, and no single registration reveals it. But where views overlap, and above all where a
 path closes a loop, their residuals can't all be small. So each error is estimated separately, with
 all poses free. An error that makes the views more consistent is a proposal. It is an alarm if it
-exceeds the calibration error of usual cameras, and if it closes a loop that pairwise alignments of
-neighbours leave open.
+exceeds the calibration error of usual cameras, and, for focal length and offset, if a loop that
+pairwise alignments of neighbours leave open confirms it.
 
 The focal length stands for other errors too: a constant offset of the depth has much the same
 effect. A camera whose range changes has no single calibration: see `range_change`.
@@ -244,8 +244,10 @@ def check_calibration(
     if large or improves:
         gap = loop_gap(views, refined, best.poses, best.errors, options)
     contradicted = (large or improves) and estimator.is_contradicted(best)
-    # Multipath has the same effect as a smaller error: views agree better, and a loop closes.
-    alarm = large and improves and gap is not None and gap.closes and not contradicted
+    # Multipath looks like a smaller focal length or offset, with which views agree better: a loop
+    # must confirm that. It does not reveal the others, whose drift resembles any other.
+    is_confirmed = best_name not in _REVEALED_BY_LOOP or (gap is not None and gap.confirms)
+    alarm = large and improves and is_confirmed and not contradicted
     if alarm:  # alternative explanations
         for name in first.determined:
             if name not in errors:

@@ -100,17 +100,28 @@ class Gap:
         return any(a >= limit for a, limit in zip(self.before, _MAX_CLOSURE_ERROR, strict=True))
 
     @property
-    def contradicts(self) -> bool:
-        """Whether the estimated errors change it much without closing it, or widen it.
+    def confirms(self) -> bool:
+        """Whether it closes, or shrinks as by the removal of a true error, but for noise.
 
-        Errors of the camera hardly change the gap of a short loop, which does not reveal them.
         Noise leaves a gap beside true errors: their removal makes the square of the gap smaller by
-        that of the change, in the mean. Less than half of that speaks against them.
+        that of the change, in the mean. Errors that are not there make it larger by as much.
         """
         before, change = self._apparent_m(*self.before), self._apparent_m(*self.change)
-        is_smaller = before**2 - self.remaining_m**2 > 0.5 * change**2
-        changes = change > 0.5 * before and not is_smaller
-        return self.significant and not self.closes and (changes or self.widens)
+        shrinks = before**2 - self.remaining_m**2 > 0.5 * change**2
+        return self.closes or (shrinks and self._is_changed)
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the estimated errors change it much without confirming them, or widen it.
+
+        Errors of the camera hardly change the gap of a short loop, which does not reveal them.
+        """
+        is_against = (self._is_changed and not self.confirms) or self.widens
+        return self.significant and not self.closes and is_against
+
+    @property
+    def _is_changed(self) -> bool:
+        return self._apparent_m(*self.change) > 0.5 * self._apparent_m(*self.before)
 
     @property
     def widens(self) -> bool:
