@@ -174,21 +174,24 @@ SWEPT[:, :3, :3] = se3.exp(
 )[:, :3, :3]
 SWEPT[:, :3, 3] = np.stack([0.4 * np.sin(SWEEP), 0.1 * np.sin(SWEEP), 0.4 * (np.cos(SWEEP) - 1)], 1)
 WIDE = BrownConrady(64, 64, 32.0, 32.0, 31.5, 31.5)
+BENT = replace(WIDE, k1=-0.15, k2=0.08)
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize(
-    ("true", "errors", "corrected"),
+    ("camera", "true", "errors", "corrected"),
     [
-        ({"fx": 31.84, "fy": 31.84}, {"focal": 0.005}, False),
-        ({"fx": 31.36, "fy": 31.36}, {"focal": 0.02}, True),
-        ({"cy": 32.46}, {"center_y": -0.03}, True),
-        ({"k1": -0.02}, {"distortion": 0.02}, True),
+        (WIDE, {"fx": 31.84, "fy": 31.84}, {"focal": 0.005}, False),
+        (WIDE, {"fx": 31.36, "fy": 31.36}, {"focal": 0.02}, True),
+        (BENT, {"fx": 31.36, "fy": 31.36}, {"focal": 0.02}, True),
+        (WIDE, {"cy": 32.46}, {"center_y": -0.03}, True),
+        (BENT, {"cy": 32.46}, {"center_y": -0.03}, True),
+        (WIDE, {"k1": -0.02}, {"distortion": 0.02}, True),
     ],
 )
-def test_wrong_intrinsics_are_corrected_or_part_of_bound(true, errors, corrected) -> None:
-    frames = views_in_room(replace(WIDE, **true), SWEPT, 0.005, 0)
-    stated = [replace(f, camera=WIDE) for f in frames]
+def test_wrong_intrinsics_are_corrected_or_part_of_bound(camera, true, errors, corrected) -> None:
+    frames = views_in_room(replace(camera, **true), SWEPT, 0.005, 0)
+    stated = [replace(f, camera=camera) for f in frames]
     result = reconstruct(Recording.of(ArraySource(stated), "", "test"), COARSE)
     error, _ = displacement(SWEPT, result.trajectory)
     d = result.diagnostics

@@ -188,6 +188,15 @@ def test_unclosed_gap_contradicts_errors() -> None:
     assert not Gap(0, 9, (0.009, 0.008), (0.009, 0.008), 1.5, changed).contradicts  # no gap
 
 
+def test_gap_that_noise_leaves_confirms_errors_by_which_it_shrinks() -> None:
+    """Independent of the change, noise leaves as much as it adds: 0.5^2 = 0.4^2 + 0.3^2."""
+    assert Gap(0, 9, (0.5, 0.0), (0.4, 0.0), 1.5, (0.3, 0.0)).confirms
+    assert not Gap(0, 9, (0.5, 0.0), (0.47, 0.0), 1.5, (0.3, 0.0)).confirms
+    assert not Gap(0, 9, (0.5, 0.0), (0.58, 0.0), 1.5, (0.3, 0.0)).confirms
+    assert not Gap(0, 9, (0.5, 0.0), (0.49, 0.0), 1.5, (0.05, 0.0)).confirms  # says nothing
+    assert Gap(0, 9, (0.5, 0.0), (0.1, 0.0), 1.5, (0.4, 0.0)).confirms  # closed
+
+
 @pytest.mark.parametrize("true", [0.0, 0.06])
 def test_views_keep_only_true_error_of_loop(true):
     views, refined = kept(true)

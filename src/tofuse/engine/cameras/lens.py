@@ -11,8 +11,8 @@ import numpy as np
 from tofuse.engine.arrays import Float32
 from tofuse.engine.cameras import lens_kernels
 
-# Coefficients of a lens without distortion.
-UNDISTORTED = np.array([1, 0, 0, 0], np.float32)
+# A lens without distortion.
+UNDISTORTED = np.array([1, 0, 0, 0, 0], np.float32)
 # Approximate number of pixels along each side that the fit uses.
 _SAMPLED = 64
 # A lens that displaces pixels by a smaller fraction of their distance from the axis has none.
@@ -21,7 +21,7 @@ _CHECKED = 50  # distances at which the distortion is checked
 
 
 def fitted_lens(rays: Float32) -> Float32:
-    """Return the coefficients c (4,) of the distortion by the squared distance s from the axis.
+    """Return the distortion (5,) by the squared distance s from the axis: c1 to c4, and largest s.
 
     It multiplies the ray by ``(1 + c1 s + c2 s^2 + c3 s^3 + c4 s^4) / (1 + s)``, which is exact for
     three radial coefficients (Brown 1966) and close for wide lenses, whose factor falls like the
@@ -39,15 +39,16 @@ def fitted_lens(rays: Float32) -> Float32:
     known = np.isfinite(rays[steps]).all(-1)
     xy, uv = rays[steps][known].astype(np.float64), pixels[known].astype(np.float64)
     squares = (xy**2).sum(-1, keepdims=True)
-    powers = squares ** np.arange(len(UNDISTORTED) + 1) / (1 + squares)
+    powers = squares ** np.arange(len(UNDISTORTED)) / (1 + squares)
     # Both coordinates together: their focal lengths differ by the shape of the pixels.
     shape = np.array([1.0, _aspect(rays)])
     distorted = (xy * shape)[:, :, None] * powers[:, None]
     ones = np.broadcast_to(np.eye(2), (len(xy), 2, 2))
     columns = np.concatenate([distorted, ones], -1).reshape(2 * len(xy), -1)
     found = np.linalg.lstsq(columns, uv.ravel(), rcond=None)[0]
-    lens = (found[1:-2] / (found[0] or 1.0)).astype(np.float32)
-    s = np.linspace(0, squares.max(initial=0.0), _CHECKED).astype(np.float32)
+    largest = squares.max(initial=0.0)
+    lens = np.array([*found[1:-2] / (found[0] or 1.0), largest], np.float32)
+    s = np.linspace(0, largest, _CHECKED).astype(np.float32)
     factor = np.array([lens_kernels.distortion(x, lens) for x in s])
     is_monotonic = (np.diff(factor * np.sqrt(s)) > 0).all()
     return lens if np.abs(factor - 1).max() > _LEAST and is_monotonic else UNDISTORTED

@@ -14,21 +14,24 @@ _ITERATIONS = 3
 
 @kernel
 def distortion(r2: np.float32, lens: Float32) -> np.float32:
-    """Return the factor by which the lens moves a ray at the squared distance r2 from the axis."""
-    one = np.float32(1)
-    return (one + r2 * (lens[0] + r2 * (lens[1] + r2 * (lens[2] + r2 * lens[3])))) / (one + r2)
+    """Return the factor by which the lens moves a ray at the squared distance r2 from the axis.
+
+    Beyond the image it stays as it is there.
+    """
+    one, s = np.float32(1), min(r2, lens[4])
+    return (one + s * (lens[0] + s * (lens[1] + s * (lens[2] + s * lens[3])))) / (one + s)
 
 
 @kernel
 def bend(r2: np.float32, lens: Float32) -> np.float32:
-    """Return s: if a ray x (2,) is distorted by the factor f, moving that by d moves x by
+    """Return b: if a ray x (2,) is distorted by the factor f, moving that by d moves x by
 
-    ``(d - s x (x . d)) / f``, the inverse of the slope ``f + f' x x^T`` of the distortion.
+    ``(d - b x (x . d)) / f``, the inverse of the slope ``f + f' x x^T`` of the distortion.
     """
     one, two, three, four = np.float32(1), np.float32(2), np.float32(3), np.float32(4)
     above = lens[0] + r2 * (two * lens[1] + r2 * (three * lens[2] + r2 * four * lens[3]))
     factor = distortion(r2, lens)
-    slope = two * (above - factor) / (one + r2)
+    slope = two * (above - factor) / (one + r2) if r2 < lens[4] else np.float32(0)
     return slope / max(factor + slope * r2, np.float32(MIN_SLOPE))
 
 
@@ -39,9 +42,9 @@ def undistorted(
     """Return the ray of the distorted one (x, y), by Newton's method from a ray near it."""
     for _ in range(_ITERATIONS):
         r2 = near_x * near_x + near_y * near_y
-        factor, s = distortion(r2, lens), bend(r2, lens)
+        factor, b = distortion(r2, lens), bend(r2, lens)
         dx, dy = x - near_x * factor, y - near_y * factor
-        along = s * (near_x * dx + near_y * dy)
+        along = b * (near_x * dx + near_y * dy)
         near_x += (dx - along * near_x) / factor
         near_y += (dy - along * near_y) / factor
     return near_x, near_y

@@ -86,7 +86,7 @@ class CameraErrors(NamedTuple):
     target_scale
         By which the depth in the target image is multiplied.
     lens
-        (4,) as of `SourcePoints`.
+        (5,) as of `SourcePoints`.
     """
 
     errors: Float64
@@ -131,7 +131,7 @@ class SourcePoints(NamedTuple):
     measures_range
         (N,) whether the camera of each view measures radial range, not z.
     lens
-        (4,) distortion of the lens of all views, see `cameras.fitted_lens`.
+        (5,) distortion of the lens of all views, see `cameras.fitted_lens`.
     """
 
     points: Float32

@@ -59,7 +59,7 @@ class Projection:
 
     @cached_property
     def lens(self) -> Float32:
-        """(4,) radial distortion of the lens, see `cameras.fitted_lens`."""
+        """(5,) radial distortion of the lens, see `cameras.fitted_lens`."""
         return fitted_lens(self.rays)
 
     @classmethod
