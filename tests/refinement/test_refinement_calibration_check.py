@@ -195,6 +195,8 @@ def test_gap_that_noise_leaves_confirms_errors_by_which_it_shrinks() -> None:
     assert not Gap(0, 9, (0.5, 0.0), (0.58, 0.0), 1.5, (0.3, 0.0)).confirms
     assert not Gap(0, 9, (0.5, 0.0), (0.49, 0.0), 1.5, (0.05, 0.0)).confirms  # says nothing
     assert Gap(0, 9, (0.5, 0.0), (0.1, 0.0), 1.5, (0.4, 0.0)).confirms  # closed
+    assert Gap(0, 9, (0.5, 0.0), (0.51, 0.0), 1.5, (0.3, 0.0)).grows
+    assert not Gap(0, 9, (0.5, 0.0), (0.49, 0.0), 1.5, (0.3, 0.0)).grows
 
 
 @pytest.mark.parametrize("true", [0.0, 0.06])

@@ -4,8 +4,8 @@ A wrong focal length or principal point, neglected lens distortion or a depth of
 trajectory, and no single registration reveals it. But where views overlap, and above all where a
 path closes a loop, their residuals can't all be small. So each error is estimated separately, with
 all poses free. An error that makes the views more consistent is a proposal. It is an alarm if it
-exceeds the calibration error of usual cameras, and, for focal length and offset, if a loop that
-pairwise alignments of neighbours leave open confirms it.
+exceeds the calibration error of usual cameras, and the gap of a loop by pairwise alignments of
+neighbours does not grow with it, or, for focal length and offset, confirms it.
 
 The focal length stands for other errors too: a constant offset of the depth has much the same
 effect. A camera whose range changes has no single calibration: see `range_change`.
@@ -245,17 +245,19 @@ def check_calibration(
         gap = loop_gap(views, refined, best.poses, best.errors, options)
     contradicted = (large or improves) and estimator.is_contradicted(best)
     # Multipath looks like a smaller focal length or offset, with which views agree better: a loop
-    # must confirm that. It does not reveal the others, whose drift resembles any other.
-    is_confirmed = best_name not in _REVEALED_BY_LOOP or (gap is not None and gap.confirms)
-    alarm = large and improves and is_confirmed and not contradicted
+    # must confirm that. The others hardly change it, as their drift resembles any other.
+    by_loop = gap is not None and (
+        gap.confirms if best_name in _REVEALED_BY_LOOP else not gap.grows
+    )
+    alarm = large and improves and by_loop and not contradicted
     if alarm:  # alternative explanations
         for name in first.determined:
             if name not in errors:
                 errors[name] = float(estimator.estimate([name]).errors[_INDEX[name]])
     elif not contradicted:
-        by_loop = _check_by_loop(views, refined, first, without_error, options)
-        if by_loop.alarm:
-            return by_loop
+        of_loop = _check_by_loop(views, refined, first, without_error, options)
+        if of_loop.alarm:
+            return of_loop
     # Estimated together, correlated errors may be large and opposite.
     largest = max(rms_motion(refined.poses, e.poses) for e in estimates.values())
     return replace(

@@ -120,6 +120,11 @@ class Gap:
         return self.significant and not self.closes and is_against
 
     @property
+    def grows(self) -> bool:
+        """Whether the estimated errors make it larger at all."""
+        return self.remaining_m > self._apparent_m(*self.before)
+
+    @property
     def _is_changed(self) -> bool:
         return self._apparent_m(*self.change) > 0.5 * self._apparent_m(*self.before)
 
