@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tofuse.engine.cameras import lens_kernels
+from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole, Rational, RayTable
-from tofuse.engine.cameras.lens import UNDISTORTED, fitted_lens, moved_rays
+from tofuse.engine.cameras.lens import UNDISTORTED, fitted, moved_rays
 
 PICO = BrownConrady(224, 171, 211.8, 211.8, 117.6, 87.2, k1=0.36, k2=-3.4, k3=6.4)
 AZURE = Rational(
@@ -22,16 +22,16 @@ def test_coefficients_of_a_lens_without_tangential_distortion_are_found() -> Non
     # (1 + k1 s + k2 s^2 + k3 s^3) (1 + s)
     expected = (1 + 0.36, 0.36 - 3.4, -3.4 + 6.4, 6.4, np.nanmax((PICO.rays() ** 2).sum(-1)))
     for camera in (PICO, replace(PICO, fy=230.0)):
-        np.testing.assert_allclose(fitted_lens(camera.rays()), expected, rtol=0.05)
+        np.testing.assert_allclose(fitted(camera.rays()), expected, rtol=0.05)
     pinhole = Pinhole(160, 120, 140.0, 150.0, 79.5, 59.5)
-    np.testing.assert_array_equal(fitted_lens(pinhole.rays()), UNDISTORTED)
+    np.testing.assert_array_equal(fitted(pinhole.rays()), UNDISTORTED)
 
 
 @pytest.mark.parametrize("camera", [PICO, AZURE, FISHEYE])
 def test_pixels_are_those_of_the_distorted_rays(camera: Pinhole) -> None:
     rays = camera.rays().astype(float)
     r2 = (rays**2).sum(-1)
-    factor = np.polyval([*fitted_lens(camera.rays())[3::-1], 1], r2) / (1 + r2)
+    factor = np.polyval([*fitted(camera.rays())[3::-1], 1], r2) / (1 + r2)
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     known = np.isfinite(r2)
 
@@ -63,7 +63,7 @@ def test_moved_rays_are_those_of_other_intrinsics(camera: Pinhole) -> None:
 def test_pixels_with_an_unknown_ray_stay_unknown() -> None:
     rays = PICO.rays().copy()
     rays[5, 7] = np.nan
-    np.testing.assert_allclose(fitted_lens(rays), fitted_lens(PICO.rays()), rtol=1e-3)
+    np.testing.assert_allclose(fitted(rays), fitted(PICO.rays()), rtol=1e-3)
     moved = moved_rays(rays, 0.01, (0.0, 0.0))
     assert np.isnan(moved[5, 7]).all()
     assert np.isfinite(moved).sum() == 2 * (224 * 171 - 1)
@@ -71,9 +71,9 @@ def test_pixels_with_an_unknown_ray_stay_unknown() -> None:
 
 def test_rays_beyond_the_image_are_distorted_as_at_its_border() -> None:
     """Points that project far outside are compared, too: no pole and no fold may reach them."""
-    lens = fitted_lens(PICO.rays())
+    lens = fitted(PICO.rays())
     far = np.float32(1e8)
-    assert lens_kernels.distortion(far, lens) == lens_kernels.distortion(lens[4], lens)
-    assert lens_kernels.bend(far, lens) == 0
-    moved = lens_kernels.undistorted(far, -far, far, -far, lens)
+    assert projection_kernels.distortion(far, lens) == projection_kernels.distortion(lens[4], lens)
+    assert projection_kernels.bend(far, lens) == 0
+    moved = projection_kernels.undistorted(far, -far, far, -far, lens)
     assert np.isfinite(moved).all()

@@ -208,7 +208,7 @@ def test_overlap_counts_points_seen_from_same_side(pair):
     assert share(T @ se3.exp(np.array([0, 0, 1.5, 0, 0, 0]))) < 0.05
 
 
-@pytest.mark.parametrize("known", [KNOWN, np.array([0, 1, 0])])
+@pytest.mark.parametrize("known", [KNOWN, np.array([0, 1, 0, 0, 1, 1, 1])])
 def test_pairs_of_target_have_equations_of_single_pairs(pair, known):
     source, target, T = pair
     errors = np.where(known, 0.0, 0.01)

@@ -2,8 +2,7 @@
 
 A `Camera` is anything with `rays()` and `project()`; `MODELS` are the lenses that `camera.json`
 names, and a `RayTable` is any other. `depth_conversion` turns radial range into depth and points;
-`projection_kernels` project into a view inside kernels, and `lens_kernels` know
-its distortion.
+`projection_kernels` project into a view inside kernels; `lens` is the distortion of any camera.
 """
 
 from typing import TYPE_CHECKING
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.cameras import depth_conversion, lens_kernels, projection_kernels
+    from tofuse.engine.cameras import depth_conversion, lens, projection_kernels
     from tofuse.engine.cameras.cameras import (
         DISTORTION_ORDER,
         MODELS,
@@ -21,12 +20,10 @@ if TYPE_CHECKING:
         Pinhole,
         Rational,
         RayTable,
-        lens_values,
         pinhole_values,
         ray_lengths,
         scaled,
         unknown_rays,
     )
-    from tofuse.engine.cameras.lens import UNDISTORTED, fitted_lens, moved_rays
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -433,9 +433,5 @@ def pinhole_values(K: Float64, shape: tuple[int, ...], where: str | Path) -> dic
             where=where,
             remedy="pass numpy.moveaxis(depth, -1, 0)",
         )
-    return lens_values(K)
-
-
-def lens_values(K: Float64) -> dict[str, float]:
-    """Return fx, fy, cx and cy of a matrix K (3, 3)."""
-    return {"fx": float(K[0, 0]), "fy": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
+    (fx, _, cx), (_, fy, cy) = K[:2].astype(float).tolist()
+    return {"fx": fx, "fy": fy, "cx": cx, "cy": cy}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Float32
-from tofuse.engine.cameras import lens_kernels
+from tofuse.engine.cameras import projection_kernels as kernels
 
 # A lens without distortion.
 UNDISTORTED = np.array([1, 0, 0, 0, 0], np.float32)
@@ -20,7 +20,7 @@ _LEAST = 1e-4
 _CHECKED = 50  # distances at which the distortion is checked
 
 
-def fitted_lens(rays: Float32) -> Float32:
+def fitted(rays: Float32) -> Float32:
     """Return the distortion (5,) by the squared distance s from the axis: c1 to c4, and largest s.
 
     It multiplies the ray by ``(1 + c1 s + c2 s^2 + c3 s^3 + c4 s^4) / (1 + s)``, which is exact for
@@ -35,7 +35,8 @@ def fitted_lens(rays: Float32) -> Float32:
         (H, W, 2) x/z and y/z of the pixels, NaN where unknown.
     """
     steps = tuple(slice(None, None, max(1, side // _SAMPLED)) for side in rays.shape[:2])
-    pixels = np.stack(np.mgrid[: rays.shape[0], : rays.shape[1]][::-1], -1)[steps]
+    height, width = rays.shape[:2]
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)[steps]
     known = np.isfinite(rays[steps]).all(-1)
     xy, uv = rays[steps][known].astype(np.float64), pixels[known].astype(np.float64)
     squares = (xy**2).sum(-1, keepdims=True)
@@ -49,7 +50,7 @@ def fitted_lens(rays: Float32) -> Float32:
     largest = squares.max(initial=0.0)
     lens = np.array([*found[1:-2] / (found[0] or 1.0), largest], np.float32)
     s = np.linspace(0, largest, _CHECKED).astype(np.float32)
-    factor = np.array([lens_kernels.distortion(x, lens) for x in s])
+    factor = np.array([kernels.distortion(x, lens) for x in s])
     is_monotonic = (np.diff(factor * np.sqrt(s)) > 0).all()
     return lens if np.abs(factor - 1).max() > _LEAST and is_monotonic else UNDISTORTED
 
@@ -78,5 +79,5 @@ def moved_rays(rays: Float32, focal: float, center: tuple[float, float]) -> Floa
         By what distorted rays are longer, as a fraction, and further right and down.
     """
     out = np.empty(rays.shape, np.float32)
-    lens_kernels.move_rays(rays, fitted_lens(rays), 1 + focal, np.array(center, float), out)
+    kernels.move_rays(rays, fitted(rays), 1 + focal, np.array(center, float), out)
     return out

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.cameras import Camera, Pinhole, RayTable, moved_rays, ray_lengths
+from tofuse.engine.cameras import Camera, Pinhole, RayTable, lens, ray_lengths
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
@@ -204,7 +204,7 @@ class CameraErrors(Bounded, Correction):
             cx, cy = stated.cx - self.center_x * fx, stated.cy - self.center_y * fy
             camera: Camera = replace(stated, fx=fx, fy=fy, cx=cx, cy=cy)
         else:
-            rays = moved_rays(stated.rays(), self.focal, (self.center_x, self.center_y))
+            rays = lens.moved_rays(stated.rays(), self.focal, (self.center_x, self.center_y))
             camera = RayTable(rays)
         if not self.distortion:
             return camera

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int64
-from tofuse.engine.cameras import lens_kernels, projection_kernels
+from tofuse.engine.cameras import projection_kernels
 from tofuse.engine.compute import kernel
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.views import residual_kernels as residual
@@ -131,7 +131,7 @@ class SourcePoints(NamedTuple):
     measures_range
         (N,) whether the camera of each view measures radial range, not z.
     lens
-        (5,) distortion of the lens of all views, see `cameras.fitted_lens`.
+        (5,) distortion of the lens of all views, see `cameras.lens.fitted`.
     """
 
     points: Float32
@@ -396,15 +396,18 @@ def _respond_to_errors(
         kept_p, kept_q = radial_p * along_p / p2, radial_q * along_q / q2
         rho2_p = lateral_p / max(pz * pz, tiny)
         rho2_q = lateral_q / max(qz * qz, tiny)
-        bend_p, bend_q = lens_kernels.bend(rho2_p, lens), lens_kernels.bend(rho2_q, lens)
+        bend_p, bend_q = (
+            projection_kernels.bend(rho2_p, lens),
+            projection_kernels.bend(rho2_q, lens),
+        )
         # Lengthening the distorted ray lengthens the ray itself by this factor.
         longer_p, longer_q = one - bend_p * rho2_p, one - bend_q * rho2_q
         across_p, across_q = m0 * px + m1 * py, n0 * qx + n1 * qy
         scaled_p, scaled_q = across_p - lateral_p * kept_p, across_q - lateral_q * kept_q
         steep_p = bend_p * across_p / max(pz * pz, tiny) + longer_p * kept_p
         steep_q = bend_q * across_q / max(qz * qz, tiny) + longer_q * kept_q
-        center_p = pz / lens_kernels.distortion(rho2_p, lens)
-        center_q = qz / lens_kernels.distortion(rho2_q, lens)
+        center_p = pz / projection_kernels.distortion(rho2_p, lens)
+        center_q = qz / projection_kernels.distortion(rho2_q, lens)
         block[(_RESPONSE + OFFSET) * residual.LANES + k] = along_p / np.sqrt(
             p2
         ) - range_q * along_q / np.sqrt(q2)
@@ -454,9 +457,9 @@ def _correct_points(block: Float32, errors: Float32, lens: Float32, radial: bool
         xn, yn = x[k] / nonzero, y[k] / nonzero
         rho2 = xn * xn + yn * yn
         length = np.sqrt(rho2 + one)
-        factor = focal * lens_kernels.distortion(rho2, lens)
+        factor = focal * projection_kernels.distortion(rho2, lens)
         # The pixel sees another ray, and along it what it measured: z or radial range.
-        ray_x, ray_y = lens_kernels.undistorted(
+        ray_x, ray_y = projection_kernels.undistorted(
             factor * xn + center_x, factor * yn + center_y, xn, yn, lens
         )
         ray_x += distortion * rho2 * xn
@@ -485,8 +488,8 @@ def _distort_projection(block: Float32, errors: Float32, lens: Float32, radial: 
         length = np.sqrt(xn[k] * xn[k] + yn[k] * yn[k] + one)
         smaller = one + distortion * (xn[k] * xn[k] + yn[k] * yn[k])
         x, y = xn[k] / smaller, yn[k] / smaller
-        factor = lens_kernels.distortion(x * x + y * y, lens)
-        ray_x, ray_y = lens_kernels.undistorted(
+        factor = projection_kernels.distortion(x * x + y * y, lens)
+        ray_x, ray_y = projection_kernels.undistorted(
             (factor * x - center_x) / focal, (factor * y - center_y) / focal, x, y, lens
         )
         longer = length / np.sqrt(ray_x * ray_x + ray_y * ray_y + one)

@@ -14,7 +14,7 @@ import numpy as np
 
 from tofuse.engine.alignment import step_kernels as steps
 from tofuse.engine.arrays import Float64, Int64, Intp
-from tofuse.engine.cameras import UNDISTORTED
+from tofuse.engine.cameras import lens
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.geometry import se3
@@ -217,7 +217,7 @@ def _sources(views: Sequence[SampledView], *, by_patch: bool) -> kernels.SourceP
         offsets[row_of_view + 1],
         np.array([v.measures_range for v in views], np.bool_),
         # Views of one recording come from one camera.
-        views[0].projection.lens if views else UNDISTORTED,
+        views[0].projection.lens if views else lens.UNDISTORTED,
     )
 
 

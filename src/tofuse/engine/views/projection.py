@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64
-from tofuse.engine.cameras import Camera, fitted_lens
+from tofuse.engine.cameras import Camera, lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +59,8 @@ class Projection:
 
     @cached_property
     def lens(self) -> Float32:
-        """(5,) radial distortion of the lens, see `cameras.fitted_lens`."""
-        return fitted_lens(self.rays)
+        """(5,) radial distortion of the lens, see `cameras.lens.fitted`."""
+        return lens.fitted(self.rays)
 
     @classmethod
     def of(cls, camera: Camera, step: int, spacing: float = 4.0) -> Projection:

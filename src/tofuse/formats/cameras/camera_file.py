@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, RayTable, lens_values
+from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import AmplitudeKind, DepthKind
 from tofuse.engine.geometry import se3
@@ -403,7 +403,8 @@ def checked_pinhole(K: Float64, size: tuple[int, int], where: str | Path) -> Pin
     InputError
         See `checked_lens`.
     """
-    return checked_lens(Pinhole, size, lens_values(K), where)
+    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    return checked_lens(Pinhole, size, values, where)
 
 
 def _color(get: _Fields) -> ColorCamera | None:
