@@ -209,12 +209,12 @@ def check_wrap(sample: Sample) -> Iterator[Finding]:
     if period is None:
         return
     signs = _WrapSigns.of(sample.images, period)
-    if not signs:
+    if not signs.are_many:
         return
     unwrap = Unwrap(period_m=period).fit(sample.images)
     unwrapped = [image for f in sample.images if isinstance(image := unwrap.apply(f), RangeFrame)]
     share = _wrapped_share(sample.images, unwrapped, period)
-    is_minority = share < _MAX_WRAPPED and not _WrapSigns.of(unwrapped, period)
+    is_minority = share < _MAX_WRAPPED and not _WrapSigns.of(unwrapped, period).are_many
     effect = (
         "Most of what the views show is nearer, and their poses follow that."
         if is_minority
@@ -238,7 +238,7 @@ def check_wrap(sample: Sample) -> Iterator[Finding]:
 
 @dataclass(frozen=True)
 class _WrapSigns:
-    """Fractions of the pixels at seams, and of those that are near but dark; true if many."""
+    """Fractions of the pixels at seams, and of those that are near but dark."""
 
     seams: float
     dark: float
@@ -267,7 +267,9 @@ class _WrapSigns:
                 dark += int(np.count_nonzero(near & is_dark))
         return cls(seams / max(valid, 1), dark / max(with_albedo, 1))
 
-    def __bool__(self) -> bool:
+    @property
+    def are_many(self) -> bool:
+        """Whether they are more than noise and dark materials leave."""
         return self.seams > _MAX_SEAM_FRACTION or self.dark > _MAX_DARK_FRACTION
 
 

@@ -433,5 +433,5 @@ def pinhole_values(K: Float64, shape: tuple[int, ...], where: str | Path) -> dic
             where=where,
             remedy="pass numpy.moveaxis(depth, -1, 0)",
         )
-    (fx, _, cx), (_, fy, cy) = K[:2].astype(float).tolist()
+    (fx, _, cx), (_, fy, cy) = K[:2, :3].astype(float).tolist()
     return {"fx": fx, "fy": fy, "cx": cx, "cy": cy}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.engine.arrays import Float32
+from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras import projection_kernels as kernels
 
 # A lens without distortion.
@@ -39,8 +39,8 @@ def fitted(rays: Float32) -> Float32:
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)[steps]
     known = np.isfinite(rays[steps]).all(-1)
     xy, uv = rays[steps][known].astype(np.float64), pixels[known].astype(np.float64)
-    squares = (xy**2).sum(-1, keepdims=True)
-    powers = squares ** np.arange(len(UNDISTORTED)) / (1 + squares)
+    squares = (xy**2).sum(-1)
+    powers = _powers(squares)
     # Both coordinates together: their focal lengths differ by the shape of the pixels.
     shape = np.array([1.0, _aspect(rays)])
     distorted = (xy * shape)[:, :, None] * powers[:, None]
@@ -49,10 +49,15 @@ def fitted(rays: Float32) -> Float32:
     found = np.linalg.lstsq(columns, uv.ravel(), rcond=None)[0]
     largest = squares.max(initial=0.0)
     lens = np.array([*found[1:-2] / (found[0] or 1.0), largest], np.float32)
-    s = np.linspace(0, largest, _CHECKED).astype(np.float32)
-    factor = np.array([kernels.distortion(x, lens) for x in s])
+    s = np.linspace(0, largest, _CHECKED)
+    factor = _powers(s) @ [1, *lens[:-1]]
     is_monotonic = (np.diff(factor * np.sqrt(s)) > 0).all()
     return lens if np.abs(factor - 1).max() > _LEAST and is_monotonic else UNDISTORTED
+
+
+def _powers(s: Float64) -> Float64:
+    """Return the terms (N, 5) of the distortion, 1 and those of c1 to c4, at distances s (N,)."""
+    return np.asarray(s[:, None] ** np.arange(len(UNDISTORTED)) / (1 + s[:, None]), np.float64)
 
 
 def _aspect(rays: Float32) -> float:

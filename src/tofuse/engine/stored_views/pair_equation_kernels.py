@@ -396,10 +396,8 @@ def _respond_to_errors(
         kept_p, kept_q = radial_p * along_p / p2, radial_q * along_q / q2
         rho2_p = lateral_p / max(pz * pz, tiny)
         rho2_q = lateral_q / max(qz * qz, tiny)
-        bend_p, bend_q = (
-            projection_kernels.bend(rho2_p, lens),
-            projection_kernels.bend(rho2_q, lens),
-        )
+        bend_p = projection_kernels.bend(rho2_p, lens)
+        bend_q = projection_kernels.bend(rho2_q, lens)
         # Lengthening the distorted ray lengthens the ray itself by this factor.
         longer_p, longer_q = one - bend_p * rho2_p, one - bend_q * rho2_q
         across_p, across_q = m0 * px + m1 * py, n0 * qx + n1 * qy

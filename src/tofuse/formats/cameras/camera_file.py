@@ -392,7 +392,7 @@ def checked_pinhole(K: Float64, size: tuple[int, int], where: str | Path) -> Pin
     Parameters
     ----------
     K
-        (3, 3) of focal lengths and principal point.
+        (3, 3) of focal lengths and principal point, or larger.
     size
         (width, height) in pixels.
     where
@@ -403,8 +403,8 @@ def checked_pinhole(K: Float64, size: tuple[int, int], where: str | Path) -> Pin
     InputError
         See `checked_lens`.
     """
-    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    return checked_lens(Pinhole, size, values, where)
+    (fx, _, cx), (_, fy, cy) = K[:2, :3].astype(float).tolist()
+    return checked_lens(Pinhole, size, {"fx": fx, "fy": fy, "cx": cx, "cy": cy}, where)
 
 
 def _color(get: _Fields) -> ColorCamera | None:
