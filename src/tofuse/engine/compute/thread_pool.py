@@ -18,7 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
@@ -111,7 +111,8 @@ class ProcessLock:
 
 
 _thread_count = usable_cores()
-# A pool for each number of threads. Pools are never shut down, as other threads may be using them.
+# Threads beside the calling one, for each number of threads. Pools are never shut down, as other
+# threads may be using them.
 _pools: dict[int, ThreadPoolExecutor] = {}
 _lock = ProcessLock()
 _thread_state = threading.local()
@@ -155,7 +156,10 @@ def chunk_bounds(size: int, chunks: int = 16) -> list[tuple[int, int]]:
 
 
 def run_chunks(function: Callable[[int, int], R], size: int, chunks: int = 16) -> list[R]:
-    """Return [function(start, stop) for each chunk], in chunk order, computed on the pool.
+    """Return [function(start, stop) for each chunk], in chunk order.
+
+    The calling thread computes chunks, too, beside one thread less of the pool: where they take
+    less time than waking another thread, it has done them all by then.
 
     Raises the exception of the first chunk that failed. Nested calls are computed serially on the
     calling thread, as waiting for the pool could deadlock.
@@ -163,14 +167,51 @@ def run_chunks(function: Callable[[int, int], R], size: int, chunks: int = 16) -
     bounds = chunk_bounds(size, chunks)
     if _thread_count == 1 or len(bounds) <= 1 or getattr(_thread_state, "inside", False):
         return [function(a, b) for a, b in bounds]
-    return list(_pool(_thread_count).map(lambda ab: function(*ab), bounds))
+    return _Shared(function, bounds).run(_thread_count)
+
+
+class _Shared(Generic[R]):
+    """Chunks that several threads take in turn, each the next one that nobody has taken."""
+
+    def __init__(self, function: Callable[[int, int], R], bounds: list[tuple[int, int]]) -> None:
+        self._function, self._bounds = function, bounds
+        self._results: dict[int, R] = {}
+        self._errors: dict[int, BaseException] = {}
+        self._numbers = iter(range(len(bounds)))  # of which each is taken once
+
+    def run(self, count: int) -> list[R]:
+        """Compute the chunks on `count` threads and return their results in order."""
+        helpers = min(count, len(self._bounds)) - 1
+        pool = _pool(count)
+        started = [pool.submit(self._work) for _ in range(helpers)]
+        _thread_state.inside = True
+        try:
+            self._work()
+        finally:
+            _thread_state.inside = False
+            for helper in started:
+                if not helper.cancel():
+                    helper.result()
+        if self._errors:
+            # Chunks are taken in order: those before the first that failed are complete.
+            raise self._errors[min(self._errors)]
+        return [self._results[k] for k in range(len(self._bounds))]
+
+    def _work(self) -> None:
+        for k in self._numbers:
+            try:
+                self._results[k] = self._function(*self._bounds[k])
+            except BaseException as error:
+                self._errors[k] = error
+                for _ in self._numbers:  # nothing more for anybody
+                    pass
 
 
 def _pool(count: int) -> ThreadPoolExecutor:
     with _lock:
         if count not in _pools:
             _pools[count] = ThreadPoolExecutor(
-                count, thread_name_prefix="tofuse", initializer=_mark_inside
+                count - 1, thread_name_prefix="tofuse", initializer=_mark_inside
             )
         return _pools[count]
 
