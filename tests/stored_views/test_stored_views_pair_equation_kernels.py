@@ -242,6 +242,39 @@ def test_pairs_of_target_have_equations_of_single_pairs(pair, known):
         np.testing.assert_array_equal(found[k], alone)
 
 
+def test_equations_of_few_points_do_not_depend_on_pairs_before(pair):
+    """As blocks are reused, errors of the camera would add up where they have no points."""
+    source, target, T = pair
+    points = points_of(prepare_view(source, SHARP), 1)
+    few = 50  # the first pair has all
+    known, errors = KNOWN.copy(), np.zeros(kernels.ERRORS)
+    known[kernels.OFFSET], errors[kernels.OFFSET] = 0, -0.05
+    count = 300
+    scales = (np.full(count, value) for value in SETTINGS[:3])
+    found = np.empty((count, kernels.SIZE))
+    kernels.target_equations(
+        kernels.SourcePoints(
+            points,
+            np.zeros(len(points), np.int64),
+            np.zeros(2, np.int64),
+            np.array([len(points), few]),
+            np.zeros(2, bool),
+            UNDISTORTED,
+        ),
+        np.minimum(np.arange(count), 1),
+        *targets([prepare_view(target, SHARP)], [0, count]),
+        np.tile(T, (count, 1, 1)),
+        kernels.PairResiduals(*scales, *SETTINGS[3:]),
+        errors,
+        known,
+        found,
+        np.empty((count, 0, kernels.PATCH_SIZE)),
+    )
+    assert np.isfinite(found).all()
+    assert found[1, kernels.COMPARED] > 0
+    np.testing.assert_array_equal(found[1:], np.tile(found[1], (count - 1, 1)))
+
+
 def test_scale_of_target_is_that_of_its_depth(pair):
     source, target, T = pair
     points = points_of(prepare_view(source, SHARP), 1)

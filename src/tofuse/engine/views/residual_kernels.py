@@ -200,10 +200,12 @@ def sum_columns(sums: Float32) -> None:
 
 @kernel
 def load_block(block: Float32, points: Float32) -> None:
-    """Copy up to `LANES` points (n, POINT_SIZE) into the columns of a block."""
+    """Copy up to `LANES` points (n, POINT_SIZE) into the columns of a block; the others are 0."""
     for k in range(len(points)):
         for c in range(POINT_SIZE):
             block[c * LANES + k] = points[k, c]
+    for c in range(POINT_SIZE):
+        block[c * LANES + len(points) : (c + 1) * LANES] = 0.0
 
 
 @kernel
