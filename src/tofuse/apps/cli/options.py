@@ -675,7 +675,8 @@ class Simulate(Seed, Threads):
     Attributes
     ----------
     scene : SCENE
-        room, empty-room, rail, torso, box, peaks
+        room, empty-room, rail, torso, box, peaks, wall, corner, flat, flat-alike, hall, corridor,
+        checkerboard
     out : DIR
         output folder
     camera : NAME
