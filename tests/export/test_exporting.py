@@ -20,7 +20,7 @@ from tofuse.engine.geometry import se3
 from tofuse.formats.geometry import las
 from tofuse.formats.geometry.ply import read_ply, write_ply
 from tofuse.formats.poses.trajectory import write_tum
-from written_run_json import write_run
+from written_run_json import change_run, write_run
 
 TIMES, POSES = np.array([0.1, 0.2, 0.5]), se3.exp(np.random.default_rng(1).normal(size=(3, 6)))
 POSES[0] = np.eye(4)
@@ -198,6 +198,17 @@ def test_large_meshes_have_vertex_colours(result: Path, upright, monkeypatch) ->
     s = upright.color / 255
     light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(found, light, atol=1e-4)
+
+
+def test_files_of_the_result_itself_are_not_replaced(result: Path, tmp_path: Path) -> None:
+    export(result, ["glb"])
+    change_run(result)  # seals the file as one that the run wrote
+    written = (result / "mesh.glb").read_bytes()
+    with pytest.raises(OutputError, match="a file of the result itself"):
+        export(result, ["glb"], faces=4, overwrite=True)
+    assert (result / "mesh.glb").read_bytes() == written
+    (path,) = export(result, ["glb"], tmp_path / "other", faces=4)
+    assert path.is_file()
 
 
 def test_laz_is_reproducible_and_written_in_blocks(result: Path, monkeypatch) -> None:

@@ -238,8 +238,15 @@ def export(
     target = folder if out is None else Path(out)
     files = {name: target / FORMATS[name][0] for name in dict.fromkeys(formats)}
     atomic.make_folder(target)
-    with folders.claimed(target), _unchanged(folder), run_json.opened(folder):
+    with folders.claimed(target), _unchanged(folder), run_json.opened(folder) as run:
+        own = run.get("sha256", {}) if target.resolve() == folder.resolve() else {}
         for path in files.values():
+            if path.name in own:
+                raise OutputError(
+                    "is a file of the result itself, which would count as edited",
+                    where=path,
+                    remedy="pass another folder with --out",
+                )
             if path.exists() and not overwrite:
                 raise OutputError(
                     "already exists", where=path, remedy="pass --overwrite to replace it"
