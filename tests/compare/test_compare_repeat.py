@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -62,6 +63,12 @@ def test_differences_between_sessions_are_separated() -> None:
     assert honest.share > 0.95
     assert honest.low < honest.share <= honest.high
     assert found.to_dict()["components"][0]["unit"] == "m"
+
+
+def test_results_of_the_same_frames_are_refused(room_result, tmp_path) -> None:
+    again = shutil.copytree(room_result, tmp_path / "again")
+    with pytest.raises(InputError, match="same recording"):
+        loaded_sessions([room_result, again], Silent())
 
 
 def test_a_single_result_is_refused(tmp_path) -> None:
