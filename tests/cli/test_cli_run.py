@@ -196,6 +196,13 @@ def test_unwrap_without_amplitude_is_rejected(recording, tmp_path, capsys) -> No
     assert "--unwrap: the recording can't be unwrapped" in capsys.readouterr().err
 
 
+def test_unwrap_of_several_frequencies_says_why_not(recording, tmp_path, capsys) -> None:
+    camera = json.loads((recording / "camera.json").read_text())
+    (recording / "camera.json").write_text(json.dumps(camera | {"ambiguity_m": 7.5}))
+    run(recording, "--out", tmp_path / "out", "--unwrap", status=2)
+    assert "ambiguity range of 7.5 m is that of several" in capsys.readouterr().err
+
+
 def test_object_option_rejects_moving_camera(room_recording, tmp_path, capsys) -> None:
     run(room_recording, "--out", tmp_path / "out", "--object", status=2)
     output = capsys.readouterr().err

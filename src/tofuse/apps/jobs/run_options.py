@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from tofuse.apps.results import run_json
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import Recording
+from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.fusion import Fusion
 from tofuse.engine.mapping import (
     MIN_MEMORY_MB,
@@ -143,7 +143,16 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
 
 def check_unwrap(recording: Recording) -> None:
     """Raise InputError if the recording can't be unwrapped."""
-    if not any(range_and_amplitude(frame, None) for frame in recording.readable(_SAMPLED)):
+    frames = list(recording.readable(_SAMPLED))
+    if not any(range_and_amplitude(frame, None) for frame in frames):
+        known = {f.ambiguity_m for f in frames if isinstance(f, RangeFrame) and f.ambiguity_m}
+        if any(range_and_amplitude(frame, min(known)) for frame in frames if known):
+            raise InputError(
+                f"the recording can't be unwrapped: its ambiguity range of {min(known):.3g} m is "
+                "that of several modulation frequencies, or its amplitude is an infrared image",
+                where="--unwrap",
+                remedy="omit it",
+            )
         raise InputError(
             "the recording can't be unwrapped: that needs its amplitude, and the ambiguity range "
             "of its camera",
