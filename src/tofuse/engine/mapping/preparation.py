@@ -57,15 +57,22 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Counts:
-    """Number of points that each filter received and removed, by its name."""
+    """Number of points that each filter received and removed, by its name.
+
+    A filter that is used twice, for tracking and for the model, received what reached it first.
+    """
 
     received: dict[str, int] = field(default_factory=dict)
     removed: dict[str, int] = field(default_factory=dict)
 
-    def add(self, removal: Removal) -> None:
-        """Count the points that a filter removed from a frame."""
-        self.received[removal.name] = self.received.get(removal.name, 0) + removal.received
-        self.removed[removal.name] = self.removed.get(removal.name, 0) + removal.removed
+    def add(self, removals: Sequence[Removal]) -> None:
+        """Count the points that the filters, in their order, removed from a frame."""
+        first: set[str] = set()
+        for removal in removals:
+            if removal.name not in first:
+                self.received[removal.name] = self.received.get(removal.name, 0) + removal.received
+                first.add(removal.name)
+            self.removed[removal.name] = self.removed.get(removal.name, 0) + removal.removed
 
     @property
     def fractions(self) -> dict[str, float]:
@@ -145,8 +152,7 @@ class Preparation:
         if filtered is None:
             filtered = self._filtered(frame, past)
         self._history.append(frame)
-        for removal in filtered.removals:
-            self.counts.add(removal)
+        self.counts.add(filtered.removals)
         return filtered
 
     def add_pose(self, frame: Frame, T_component_camera: Float64) -> None:
