@@ -29,6 +29,7 @@ from tofuse.engine.errors import OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.fusion.cloud import Cloud, empty_cloud
 from tofuse.engine.fusion.drawing import display_colors
+from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.pose_errors import UNKNOWN_M
 from tofuse.engine.geometry import se3
@@ -212,6 +213,29 @@ def test_reasons_name_their_frames(tmp_path):
         page(tmp_path, result, ReportExtras("x")).sections["verdict"].split()
     )
     assert "Surfaces do not agree (frames 3-4, 20-34, 50)." in text_of_verdict
+
+
+def test_summary_names_the_fault_of_the_recording(tmp_path):
+    text = "The median depth is 11 m. Check depth_unit_m."
+    result = lonely(verdict="degraded", reasons=(Reason("faulty_recording", ((0, 0),), text),))
+    assert text in " ".join(page(tmp_path, result, ReportExtras("x")).sections["summary"].split())
+
+
+def test_surface_without_triangles_is_counted(tmp_path):
+    record = GeometryRecord(np.zeros((0, 3)), faces=np.zeros((0, 3), np.int32))
+    got = page(tmp_path, replace(lonely(), mesh=Mesh.of(record)), ReportExtras("x"))
+    assert "0 triangles" in got.sections["frames"]
+
+
+def test_filter_used_twice_removes_a_fraction_of_what_reached_it_first(tmp_path):
+    first = unlit()
+    first = replace(first, depth=np.ones_like(first.depth))
+    halves = [replace(first, depth=first.depth.copy()) for _ in range(2)]
+    for frame, columns in zip(halves, (4, 8), strict=True):
+        frame.depth[:, :columns] = 0
+    share = f"{100 * 8 / first.depth.shape[1]:.1f} %"
+    steps = (("raw", first), ("confidence", halves[0]), ("confidence", halves[1]))
+    assert share in page(tmp_path, lonely(), ReportExtras("x", steps)).sections["filters"]
 
 
 def in_parts(number=20):

@@ -42,7 +42,7 @@ def frames(s: Subject) -> Values:
     travelled = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     return {
         "counts": [(f"frames {name}", f"{number:,}") for name, number in counts],
-        "triangles": s.scene.surface and len(s.scene.surface.faces),
+        "triangles": None if s.result.mesh is None else len(s.result.mesh.faces),
         "points": s.scene.total,
         "travelled": travelled if len(path) > 1 else None,
         "lanes": [*words.STATUSES, *(["component"] if len(components) > 1 else [])],
@@ -163,8 +163,8 @@ def loops(s: Subject) -> Values:
 def filters(s: Subject) -> Values:
     """Return one frame after each filter (figure 3.2), and the fractions removed."""
     removed, steps = s.result.diagnostics.removed, s.extras.filter_steps
-    gone: Counter[str] = Counter()  # a filter may be used twice
-    reached: Counter[str] = Counter()
+    gone: Counter[str] = Counter()
+    reached: dict[str, int] = {}  # the first time, as a filter may be used twice
     values: Values = {"steps": []}
     if steps:
         raw = previous = steps[0][1]
@@ -176,12 +176,12 @@ def filters(s: Subject) -> Values:
             num_removed = len(previous) - len(frame)
             values["steps"].append((name, len(frame), num_removed, images))
             if k:
+                reached.setdefault(name, len(previous))
                 gone[name] += num_removed
-                reached[name] += len(previous)
             previous = frame
     # Corrections remove nothing.
     names = [*removed, *(n for n in gone if n not in removed and gone[n])]
-    fractions = [gone[n] / reached[n] if reached[n] else None for n in names]
+    fractions = [gone[n] / reached[n] if reached.get(n) else None for n in names]
     whole = [removed.get(n) for n in names]
     return values | {"rows": list(zip(names, whole, fractions, strict=True))}
 

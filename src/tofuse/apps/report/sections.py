@@ -86,6 +86,8 @@ def _verdict(s: Subject) -> Values:
     if a.worst is not None and not frames:
         frames = [a.worst.frame, a.worst.frame]
     findings = words.findings(d.reasons, len(d.frames))
+    # On this page the inspection is out of sight, so its findings stand here.
+    faults = " ".join(r.text for r in d.reasons if r.code == "faulty_recording")
     return {
         "headline": s.extras.headline,
         "bound": accuracy_card.bound(a, s.result.cloud.diagonal_m).removeprefix("accuracy "),
@@ -93,7 +95,7 @@ def _verdict(s: Subject) -> Values:
         "frames": frames,
         "plain": _plain(s),
         "outcome": _OUTCOMES[d.verdict],
-        "advice": "" if d.verdict == "good" else accuracy_card.advice(d.reasons),
+        "advice": "" if d.verdict == "good" else faults or accuracy_card.advice(d.reasons),
         "card_tone": d.verdict if d.accuracy.assessed else "",
         "tone": d.verdict,
         "posed": int(s.result.has_pose.sum()),
