@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from tofuse.apps.card.making import Card, make_card
 from tofuse.apps.card.page import write_page
-from tofuse.apps.results import folders
-from tofuse.formats.files import atomic
+from tofuse.apps.results import folders, run_json
 
 CARD, PAGE = "card.json", "card.html"
+_CONTRACT = folders.Contract.of_files(CARD, PAGE, keys=("camera", "quantities"))
 
 
 @dataclass(frozen=True)
@@ -32,22 +30,12 @@ def card_files(results: Sequence[Path], options: CardOptions) -> Card:
     OutputError
         If it can't be written; existing files are then unchanged.
     """
-    if options.out is None:
-        return make_card(results)
-    with folders.OutputFolder(
+    with folders.output_folder(
         options.out, overwrite=options.overwrite, contract=_CONTRACT
     ) as folder:
         card = make_card(results)
-        with folder.staging() as staging:
-            text = json.dumps(card.to_dict(), indent=1, allow_nan=False)
-            atomic.write_text(staging / CARD, text + "\n")
-            write_page(card, staging / PAGE)
+        if folder is not None:
+            with folder.staging() as staging:
+                run_json.write_object(staging / CARD, card.to_dict())
+                write_page(card, staging / PAGE)
     return card
-
-
-def _is_ours(folder: Path) -> bool:
-    data = folders.read_json_object(folder / CARD)
-    return data is not None and {"schema", "version", "camera", "quantities"} <= set(data)
-
-
-_CONTRACT = folders.Contract(re.compile(r"card\.(json|html)"), CARD, _is_ours)

@@ -106,7 +106,7 @@ class Card:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of `card.json`: SI units, pixels, null where unknown."""
-        data: dict[str, Any] = run_json.plain(
+        return run_json.plain(
             {
                 "schema": 1,
                 "version": __version__,
@@ -118,7 +118,6 @@ class Card:
                 "warnings": self.warnings,
             }
         )
-        return data
 
 
 def make_card(results: Sequence[Path]) -> Card:

@@ -187,7 +187,7 @@ class Comparison:
     def to_dict(self) -> dict[str, Any]:
         """Return the content of `compare.json`: SI units, null where unknown."""
         places, found = self.deviations.places, self.registration
-        data: dict[str, Any] = run_json.plain(
+        return run_json.plain(
             {
                 "schema": 1,
                 "version": __version__,
@@ -218,7 +218,6 @@ class Comparison:
                 "warnings": self.warnings,
             }
         )
-        return data
 
 
 def _places(chosen: Bool) -> str:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-import json
-import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -17,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from tofuse.apps.compare.comparing import Comparison, compare
 from tofuse.apps.compare.page import colors, limit_of, write_compare_report
 from tofuse.apps.compare.repeating import Repetition, loaded_sessions, repeated
-from tofuse.apps.results import folders
+from tofuse.apps.results import folders, run_json
 from tofuse.engine.compute import threads
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.progress import Progress
@@ -27,6 +25,14 @@ from tofuse.formats.poses import read_pose
 
 T = TypeVar("T")
 COMPARED, REPEATED = "compare.json", "repeat.json"
+COMPARE_CONTRACT = folders.Contract.of_files(
+    COMPARED,
+    "deviations.csv",
+    "deviations.ply",
+    "report.html",
+    keys=("regions", "tolerance_m"),
+)
+REPEAT_CONTRACT = folders.Contract.of_files(REPEATED, "repeat.csv", keys=("components", "bounds"))
 _STATUS = {None: 0, "pass": 0, "fail": 3, "undecided": 4}
 
 
@@ -109,7 +115,7 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
         ),
     )
     write_compare_report(comparison, folder / "report.html")
-    _write_json(comparison.to_dict(), folder / COMPARED)
+    run_json.write_object(folder / COMPARED, comparison.to_dict())
 
 
 def repeat_files(results: Sequence[Path], options: RepeatOptions, progress: Progress) -> Repetition:
@@ -124,7 +130,7 @@ def repeat_files(results: Sequence[Path], options: RepeatOptions, progress: Prog
     def write(repetition: Repetition, folder: Path) -> None:
         rows = [vars(component) for component in repetition.components]
         atomic.write_text(folder / "repeat.csv", _table(rows))
-        _write_json(repetition.to_dict(), folder / REPEATED)
+        run_json.write_object(folder / REPEATED, repetition.to_dict())
 
     return _done(work, write, options, REPEAT_CONTRACT)
 
@@ -136,13 +142,15 @@ def _done(
     contract: folders.Contract,
 ) -> T:
     """Do the work, and write what was found if there is a folder for it, which is checked first."""
-    with threads(options.threads), threadpool_limits(1):
-        if options.out is None:
-            return work()
-        with folders.OutputFolder(
+    with (
+        threads(options.threads),
+        threadpool_limits(1),
+        folders.output_folder(
             options.out, overwrite=options.overwrite, contract=contract
-        ) as folder:
-            found = work()
+        ) as folder,
+    ):
+        found = work()
+        if folder is not None:
             with folder.staging() as staging:
                 write(found, staging)
     return found
@@ -155,21 +163,3 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> str:
         writer.writeheader()
         writer.writerows(rows)
     return text.getvalue()
-
-
-def _write_json(data: Mapping[str, Any], path: Path) -> None:
-    atomic.write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
-
-
-def _contract(marker: str, files: Iterable[str], *fields: str) -> folders.Contract:
-    def is_ours(folder: Path) -> bool:
-        data = folders.read_json_object(folder / marker)
-        return data is not None and {"schema", "version", *fields} <= set(data)
-
-    return folders.Contract(re.compile("|".join(map(re.escape, (marker, *files)))), marker, is_ours)
-
-
-COMPARE_CONTRACT = _contract(
-    COMPARED, ("deviations.csv", "deviations.ply", "report.html"), "regions", "tolerance_m"
-)
-REPEAT_CONTRACT = _contract(REPEATED, ("repeat.csv",), "components", "bounds")

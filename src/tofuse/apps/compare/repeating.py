@@ -138,7 +138,7 @@ class Repetition:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of `repeat.json`: SI units and radians, null where unknown."""
-        data: dict[str, Any] = run_json.plain(
+        return run_json.plain(
             {
                 "schema": 1,
                 "version": __version__,
@@ -149,7 +149,6 @@ class Repetition:
                 "warnings": self.warnings,
             }
         )
-        return data
 
 
 def loaded_sessions(paths: Sequence[Path], progress: Progress) -> list[Session]:

@@ -13,9 +13,7 @@ poses that a run bounded by all of its frames, the run's bound, unless the sampl
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -502,12 +500,7 @@ def judge_files(
     """
     opening = Opening.of(inputs, options)
     recording = opening.open()
-    out = options.out
-    with (
-        nullcontext()
-        if out is None
-        else folders.OutputFolder(out, overwrite=options.overwrite) as folder
-    ):
+    with folders.output_folder(options.out, overwrite=options.overwrite) as folder:
         judgement = judge(
             recording,
             trajectory,
@@ -536,8 +529,7 @@ def _write(
         title = f"{trajectory.name} on {Path(refined.recording['path']).name}"
         write_report(result, path / "report.html", ReportExtras(title, headline=headline))
         if result is refined:
-            text = json.dumps(run_json.plain(judgement.to_dict()), indent=1, allow_nan=False)
-            (path / "judge.json").write_text(text + "\n", encoding="utf-8")
+            run_json.write_object(path / "judge.json", judgement.to_dict())
 
     write_result(refined, folder, report)
 

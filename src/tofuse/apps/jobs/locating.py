@@ -6,8 +6,6 @@ poses. The frames of a clip are tracked, and a few of them located together.
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +31,6 @@ from tofuse.engine.results import Reconstruction
 from tofuse.engine.search import pose_probability
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.tracking import Keyframes, given
-from tofuse.formats.files import atomic
 from tofuse.formats.poses import write_tum
 from tofuse.formats.recordings import Opening, OpeningOptions, open_view
 
@@ -42,6 +39,7 @@ _LOCATED = 4
 _MAX_STATED = 0.999
 _NOWHERE = "no place in the map resembles it"
 MARKER, TRAJECTORY = "locations.json", "trajectory.txt"
+_CONTRACT = folders.Contract.of_files(MARKER, TRAJECTORY, keys=("frames",))
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +86,7 @@ class LocatedFrame:
                 "probability": location.probability,
                 "runner_up": location.runner_up,
             }
-        plain: dict[str, Any] = run_json.plain(found)
-        return plain
+        return run_json.plain(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,14 +262,13 @@ def locate_files(
     """
     with threads(options.threads), threadpool_limits(1):
         progress.stage("opening")
-        if options.out is None:
-            return _located_in(result, name, options, progress)
-        with folders.OutputFolder(
-            options.out, overwrite=options.overwrite, contract=CONTRACT
+        with folders.output_folder(
+            options.out, overwrite=options.overwrite, contract=_CONTRACT
         ) as folder:
             located = _located_in(result, name, options, progress)
-            progress.stage("writing")
-            _write(located, result, name, folder)
+            if folder is not None:
+                progress.stage("writing")
+                _write(located, result, name, folder)
     return located
 
 
@@ -359,15 +355,4 @@ def _write(
     poses = np.array([f.location.T_map_camera for f in accepted if f.location]).reshape(-1, 4, 4)
     with folder.staging() as staging:
         write_tum(staging / TRAJECTORY, [f.timestamp for f in accepted], poses)
-        text = json.dumps(locations_json(located, result, name), indent=1, allow_nan=False)
-        atomic.write_text(staging / MARKER, text + "\n")
-
-
-def _is_ours(folder: Path) -> bool:
-    data = folders.read_json_object(folder / MARKER)
-    return data is not None and {"schema", "version", "frames"} <= set(data)
-
-
-CONTRACT = folders.Contract(
-    re.compile("|".join(map(re.escape, (MARKER, TRAJECTORY)))), MARKER, _is_ours
-)
+        run_json.write_object(staging / MARKER, locations_json(located, result, name))

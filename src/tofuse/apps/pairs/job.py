@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -17,15 +16,9 @@ from tofuse.apps.pairs.registering import (
     registered_scaled,
     registrar_of,
 )
-from tofuse.apps.pairs.result import (
-    CONTRACT,
-    MARKER,
-    PairResult,
-    pair_json,
-    write_aligned,
-)
+from tofuse.apps.pairs.result import CONTRACT, MARKER, PairResult, pair_json, write_aligned
 from tofuse.apps.pairs.views import named_view
-from tofuse.apps.results import folders
+from tofuse.apps.results import folders, run_json
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds import NearOrigin
 from tofuse.engine.compute import threads
@@ -92,14 +85,13 @@ def register_files(
     with threads(options.threads), threadpool_limits(1):
         progress.stage("opening")
         guess = None if options.guess is None else read_pose(options.guess)
-        if options.out is None:
-            return _registered(source, target, guess, options, progress)
-        with folders.OutputFolder(
+        with folders.output_folder(
             options.out, overwrite=options.overwrite, contract=CONTRACT
         ) as folder:
             result = _registered(source, target, guess, options, progress)
-            progress.stage("writing")
-            _write(result, folder)
+            if folder is not None:
+                progress.stage("writing")
+                _write(result, folder)
     return result
 
 
@@ -155,5 +147,4 @@ def _write(result: PairResult, folder: folders.OutputFolder) -> None:
         atomic.write_text(staging / "transform.txt", pose_text(result.similarity))
         write_aligned(result, staging / "aligned.ply")
         write_pair_report(result, staging / "report.html")
-        text = json.dumps(pair_json(result), indent=1, allow_nan=False)
-        atomic.write_text(staging / MARKER, text + "\n")
+        run_json.write_object(staging / MARKER, pair_json(result))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +20,9 @@ from tofuse.formats.geometry import write_ply
 from tofuse.formats.recordings import SingleView
 
 MARKER = "registration.json"
-FILES = ("transform.txt", "aligned.ply", "report.html", MARKER)
+CONTRACT = folders.Contract.of_files(
+    MARKER, "transform.txt", "aligned.ply", "report.html", keys=("T_target_source",)
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +129,7 @@ def pair_json(result: PairResult) -> dict[str, Any]:
     """Return the content of `registration.json`: SI units and radians, null where unknown."""
     registration = result.registration
     covariance, (sigma_m, sigma_rad) = registration.covariance, registration.sigma
-    data: dict[str, Any] = run_json.plain(
+    return run_json.plain(
         {
             "schema": 1,
             "version": __version__,
@@ -151,7 +152,6 @@ def pair_json(result: PairResult) -> dict[str, Any]:
             "warnings": [*result.source.warnings, *result.target.warnings],
         }
     )
-    return data
 
 
 def _view_json(view: SingleView) -> dict[str, Any]:
@@ -162,15 +162,6 @@ def _view_json(view: SingleView) -> dict[str, Any]:
         "frame": view.index,
         "points": len(view.frame),
     }
-
-
-def is_registration(folder: Path) -> bool:
-    """Whether a folder contains an earlier registration."""
-    data = folders.read_json_object(folder / MARKER)
-    return data is not None and {"schema", "version", "T_target_source"} <= set(data)
-
-
-CONTRACT = folders.Contract(re.compile("|".join(map(re.escape, FILES))), MARKER, is_registration)
 
 
 def write_aligned(result: PairResult, path: Path) -> None:

@@ -8,8 +8,8 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,13 +44,24 @@ class Contract:
         Pattern of the paths of its files, relative to its folder.
     marker
         The file by which it is recognised.
-    is_ours
-        Whether a folder contains a result of this kind.
+    keys
+        What the JSON object in that file has, apart from `schema` and `version`.
     """
 
     files: re.Pattern[str]
     marker: str
-    is_ours: Callable[[Path], bool]
+    keys: frozenset[str]
+
+    @classmethod
+    def of_files(cls, marker: str, *others: str, keys: Iterable[str]) -> Contract:
+        """Return the contract of a result that consists of these files alone."""
+        names = "|".join(map(re.escape, (marker, *others)))
+        return cls(re.compile(names), marker, frozenset(keys))
+
+    def is_ours(self, folder: Path) -> bool:
+        """Whether a folder contains a result of this kind."""
+        data = read_json_object(folder / self.marker)
+        return data is not None and {"schema", "version", *self.keys} <= set(data)
 
     def foreign(self, folder: Path, prefix: str = "") -> str | None:
         """Return the path of a file or link in a folder that no such result has, relative to it.
@@ -145,6 +156,18 @@ class OutputFolder(staging.StagedFolder):
             )
 
 
+def output_folder(
+    path: Path | None, *, overwrite: bool, contract: Contract | None = None
+) -> AbstractContextManager[OutputFolder | None]:
+    """Return the folder for the result of a command; None in a context if it is not to be written.
+
+    See `OutputFolder` for the arguments and the errors.
+    """
+    if path is None:
+        return nullcontext()
+    return OutputFolder(path, overwrite=overwrite, contract=contract)
+
+
 def check_output(path: Path, *, overwrite: bool) -> None:
     """Check early whether `OutputFolder` will accept a folder, before long work.
 
@@ -229,8 +252,7 @@ def check_result(folder: Path) -> None:
 
 def is_result(folder: Path) -> bool:
     """Whether a folder contains the result of a run."""
-    data = read_json_object(folder / RESULT.marker)
-    return data is not None and {"schema", "version", "verdict"} <= set(data)
+    return RESULT.is_ours(folder)
 
 
 def read_json_object(path: Path) -> dict[str, object] | None:
@@ -256,5 +278,5 @@ _EXPORTED = rf"nerfstudio/(transforms\.json|points\.ply|{_IMAGES})|colmap/{_IMAG
 RESULT = Contract(
     re.compile(rf"({_COMPONENT.pattern}/)?({_FILE})|{_EXPORTED}", re.ASCII),
     "run.json",
-    is_result,
+    frozenset({"verdict"}),
 )

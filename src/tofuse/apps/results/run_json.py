@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, TextIO, overload
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.refinement import Refinement, calibration_check
 from tofuse.engine.results import FrameRecord, Mirror, Reason, Reconstruction, SelfCalibration
-from tofuse.formats.files import reading
+from tofuse.formats.files import atomic, reading
 from tofuse.formats.poses import read_tum
 
 
@@ -198,6 +198,10 @@ def _suspicion(check: calibration_check.CalibrationCheck | None) -> dict[str, An
     }
 
 
+@overload
+def plain(value: dict[str, Any]) -> dict[str, Any]: ...
+@overload
+def plain(value: Any) -> Any: ...
 def plain(value: Any) -> Any:
     """Convert arrays and NumPy numbers to JSON values; NaN and infinity become null."""
     if isinstance(value, dict):
@@ -210,6 +214,17 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         return plain(value.item())
     return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def write_object(path: Path, data: dict[str, Any]) -> None:
+    """Write an object of plain data and arrays as JSON, what is not finite as null.
+
+    Raises
+    ------
+    OutputError
+        If the file can't be written; an existing one is then unchanged.
+    """
+    atomic.write_text(path, json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
 
 
 def read_run_json(path: str | Path) -> dict[str, Any]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections import Counter
 from collections.abc import Mapping
 from functools import cache
@@ -27,8 +25,8 @@ from tofuse.lab.experiments.statements import JudgedStatement, Results, judge_al
 if TYPE_CHECKING:
     from jinja2 import Template
 
-KIND = "experiments"
 _MARKER = "results.json"
+_CONTRACT = folders.Contract.of_files(_MARKER, "index.html", keys=("kind", "statements"))
 NAMES = (*(case.scene for case in CASES), "peaks")
 
 
@@ -92,20 +90,8 @@ def run_experiments(
         data = results_json(results, judged, parameters, seconds)
         with folder.staging() as staging:
             (staging / "index.html").write_text(page, encoding="utf-8")
-            text = json.dumps(run_json.plain(data), indent=1, allow_nan=False)
-            (staging / _MARKER).write_text(text + "\n", encoding="utf-8")
+            run_json.write_object(staging / _MARKER, data)
     return out / "index.html"
-
-
-def is_experiments(folder: Path) -> bool:
-    """Whether a folder contains the result of earlier experiments."""
-    data = folders.read_json_object(folder / _MARKER)
-    return data is not None and data.get("kind") == KIND
-
-
-_CONTRACT = folders.Contract(
-    re.compile(rf"index\.html|{re.escape(_MARKER)}"), _MARKER, is_experiments
-)
 
 
 def _run_all(
@@ -136,7 +122,7 @@ def results_json(
 ) -> dict[str, Any]:
     """Return the content of ``results.json``: SI units, and degrees where a name says so."""
     return {
-        "kind": KIND,
+        "kind": "experiments",
         "schema": 1,
         "version": __version__,
         "parameters": dict(parameters),
