@@ -47,6 +47,8 @@ def from_arguments(cls: type[_Options], arguments: cli.Command, **overrides: Any
 
     Fields without an argument keep their defaults; `overrides` override both.
     """
+    if isinstance(arguments, cli.Written) and arguments.overwrite and arguments.out is None:
+        raise InputError("requires --out", where="--overwrite", remedy="pass --out as well")
     names = [f.name for f in fields(cls) if hasattr(arguments, f.name)]
     return cls(**{name: getattr(arguments, name) for name in names} | overrides)
 
@@ -63,6 +65,10 @@ def show(
     status: int = 0,
 ) -> int:
     """Print a result, with --json `data` and else `lines`, and return the exit status."""
+    if isinstance(arguments, cli.Written):
+        data = {**data, "out": None if arguments.out is None else str(arguments.out)}
+        if arguments.out is not None:
+            lines = (*lines, escaped(f"see {_page_of(arguments.out)}"))
     if arguments.json:
         emit(data)
     else:
@@ -220,7 +226,6 @@ def register(arguments: cli.Register) -> int:
         register_files,
     )
 
-    check_overwrite(arguments)
     options = from_arguments(PairOptions, arguments)
     with progress_unless_json(arguments) as progress:
         result = register_files(arguments.source, arguments.target, options, progress)
@@ -231,7 +236,7 @@ def register(arguments: cli.Register) -> int:
     width = max(_NAME_WIDTH, *(len(name) for name, _ in found))
     return show(
         arguments,
-        {**data, "out": out_json(options.out)},
+        data,
         f"[bold {color}]{head.lower()}[/]" + (f": {escaped(tail)}" if tail else ""),
         *(
             escaped(f"{title:<{width}}  {row}".rstrip())
@@ -239,19 +244,8 @@ def register(arguments: cli.Register) -> int:
             for title, row in zip_longest([name], value.split("\n"), fillvalue="")
         ),
         *warning_lines(data["warnings"]),
-        *_see(options.out),
         status=pair_exit_status(result),
     )
-
-
-def out_json(out: Path | None) -> str | None:
-    """Return an optional output folder for --json."""
-    return None if out is None else str(out)
-
-
-def _see(out: Path | None) -> list[str]:
-    """Return the line that names the report in an output folder, if there is one."""
-    return [] if out is None else [escaped(f"see {_page_of(out)}")]
 
 
 def judge(arguments: cli.Judge) -> int:
@@ -259,7 +253,6 @@ def judge(arguments: cli.Judge) -> int:
     from tofuse.apps.jobs import judging
     from tofuse.apps.results import run_json
 
-    check_overwrite(arguments)
     options = from_arguments(judging.JudgeOptions, arguments)
     with progress_unless_json(arguments) as progress:
         judgement = judging.judge_files(
@@ -273,11 +266,10 @@ def judge(arguments: cli.Judge) -> int:
     ]
     return show(
         arguments,
-        {**run_json.plain(judgement.to_dict()), "out": out_json(options.out)},
+        run_json.plain(judgement.to_dict()),
         *_verdict_lines(judgement.verdict, judgement.reasons),
         escaped(judging.sentence(judgement, arguments.trajectory.name)),
         *([f"map consistency: {'; '.join(texts)}"] if texts else []),
-        *_see(options.out),
         status=3 if judgement.verdict == "failed" else 0,
     )
 
@@ -296,7 +288,6 @@ def locate(arguments: cli.Locate) -> int:
     """``tofuse locate``."""
     from tofuse.apps.jobs import locating
 
-    check_overwrite(arguments)
     options = from_arguments(locating.LocateOptions, arguments)
     with progress_unless_json(arguments) as progress:
         located = locating.locate_files(arguments.result, arguments.input, options, progress)
@@ -306,23 +297,7 @@ def locate(arguments: cli.Locate) -> int:
         head, color = ("accepted", "green") if frame.accepted else ("rejected", "red")
         lines.append(f"[bold {color}]{head}[/] {escaped(locating.sentence(frame))}")
     lines.append(f"{data['accepted']} of {len(located)} frames located")
-    if options.out is not None:
-        lines.append(escaped(f"see {options.out}"))
-    return show(
-        arguments,
-        {**data, "out": out_json(options.out)},
-        *lines,
-        status=0 if data["accepted"] == len(located) else 3,
-    )
-
-
-def check_overwrite(
-    arguments: cli.Register | cli.Judge | cli.Locate | cli.Compare | cli.Repeat | cli.Card,
-) -> None:
-    """Refuse --overwrite without --out, where that is optional."""
-
-    if arguments.overwrite and arguments.out is None:
-        raise InputError("requires --out", where="--overwrite", remedy="pass --out as well")
+    return show(arguments, data, *lines, status=0 if data["accepted"] == len(located) else 3)
 
 
 def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
@@ -373,9 +348,9 @@ def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
 
 
 def _page_of(folder: Path) -> Path:
-    """Return the report of a result; its folder with --no-report."""
-    page = folder / "report.html"
-    return page if page.is_file() else folder
+    """Return the page in the folder of a result; the folder if there is none."""
+    pages = (folder / name for name in ("report.html", "card.html"))
+    return next((page for page in pages if page.is_file()), folder)
 
 
 def _verdict_lines(verdict: str, reasons: Sequence[Reason]) -> list[str]:

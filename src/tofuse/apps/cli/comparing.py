@@ -5,14 +5,7 @@ from __future__ import annotations
 from rich.table import Table
 
 from tofuse.apps.cli import options as cli
-from tofuse.apps.cli.commands import (
-    check_overwrite,
-    from_arguments,
-    out_json,
-    progress_unless_json,
-    show,
-    warning_lines,
-)
+from tofuse.apps.cli.commands import from_arguments, progress_unless_json, show, warning_lines
 from tofuse.apps.cli.progress import escaped
 
 _COLORS = {"pass": "green", "fail": "red", "undecided": "yellow"}
@@ -23,7 +16,6 @@ def compare(arguments: cli.Compare) -> int:
     """``tofuse compare``."""
     from tofuse.apps.compare import CompareOptions, compare_exit_status, compare_files, millimetres
 
-    check_overwrite(arguments)
     options = from_arguments(CompareOptions, arguments)
     with progress_unless_json(arguments) as progress:
         comparison = compare_files(arguments.result, arguments.reference, options, progress)
@@ -46,11 +38,10 @@ def compare(arguments: cli.Compare) -> int:
         )
     return show(
         arguments,
-        {**comparison.to_dict(), "out": out_json(options.out)},
+        comparison.to_dict(),
         sentence,
         table,
         *warning_lines(comparison.warnings),
-        *([] if options.out is None else [escaped(f"see {options.out / 'report.html'}")]),
         status=compare_exit_status(comparison),
     )
 
@@ -59,7 +50,6 @@ def repeat(arguments: cli.Repeat) -> int:
     """``tofuse repeat``."""
     from tofuse.apps.compare import RepeatOptions, repeat_files
 
-    check_overwrite(arguments)
     options = from_arguments(RepeatOptions, arguments)
     with progress_unless_json(arguments) as progress:
         found = repeat_files(arguments.results, options, progress)
@@ -82,13 +72,12 @@ def repeat(arguments: cli.Repeat) -> int:
     sessions = len({session.session for session in found.sessions})
     return show(
         arguments,
-        {**found.to_dict(), "out": out_json(options.out)},
+        found.to_dict(),
         f"{len(found.sessions)} results of {sessions} session{'s' * (sessions > 1)}, "
         f"{found.common:.0%} of the first surface seen by all",
         table,
         *map(escaped, bounds),
         *warning_lines(found.warnings),
-        *([] if options.out is None else [escaped(f"see {options.out}")]),
     )
 
 
@@ -96,7 +85,6 @@ def card(arguments: cli.Card) -> int:
     """``tofuse card``."""
     from tofuse.apps.card import CardOptions, card_files
 
-    check_overwrite(arguments)
     options = from_arguments(CardOptions, arguments)
     found = card_files(arguments.results, options)
     table = Table("quantity", "mean", "scatter", "over the time", "p", "", box=None)
@@ -104,11 +92,10 @@ def card(arguments: cli.Card) -> int:
         table.add_row(*row)
     return show(
         arguments,
-        {**found.to_dict(), "out": out_json(options.out)},
+        found.to_dict(),
         escaped(f"{len(found.sessions)} results of {found.camera}"),
         escaped(found.sentence),
         table,
         *warning_lines(found.warnings),
-        *([] if options.out is None else [escaped(f"see {options.out / 'card.html'}")]),
         status=3 if found.changed else 0,
     )

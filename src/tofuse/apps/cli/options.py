@@ -75,6 +75,21 @@ class Json(Command):
     json: bool = False
 
 
+class Written(Command):
+    """A result that is printed, and written if there is a folder for it.
+
+    Attributes
+    ----------
+    out : DIR
+        folder for the result (none)
+    overwrite
+        replace an existing one in --out
+    """
+
+    out: Path | None = None
+    overwrite: bool = False
+
+
 class Edited(Command):
     """Results that were edited.
 
@@ -309,7 +324,7 @@ class Batch(Command):
     retries: NonNegative | None = None
 
 
-class Register(Json, Threads, Source):
+class Register(Written, Json, Threads, Source):
     """Register two files or frames.
 
     A view is a file with a single view (PLY, PCD, LAS, LAZ, E57, ...), a mesh (PLY, OBJ, STL,
@@ -329,10 +344,6 @@ class Register(Json, Threads, Source):
         the source is of unknown scale, as models from images alone are
     risk : P
         probability with which an accepted pose may be wrong, up to 0.1 (0.1)
-    out : DIR
-        folder for the result (none)
-    overwrite
-        replace an existing one in --out
 
     Exit status
     -----------
@@ -347,11 +358,9 @@ class Register(Json, Threads, Source):
     method: str | None = None
     scale: bool = False
     risk: float = 0.1
-    out: Path | None = None
-    overwrite: bool = False
 
 
-class Judge(Json, Threads, Selection):
+class Judge(Written, Json, Threads, Selection):
     """Assess poses from any source, without a reference.
 
     Attributes
@@ -362,8 +371,6 @@ class Judge(Json, Threads, Selection):
         a trajectory in any supported format, a result, or a recording with poses
     out : DIR
         folder for the refined result (none)
-    overwrite
-        replace an existing result in --out
     tolerance : LENGTH
         accuracy required of good poses, e.g. 30mm (0.5 % of the model, at least 10mm)
     scale
@@ -380,8 +387,6 @@ class Judge(Json, Threads, Selection):
 
     recording: str
     trajectory: Path
-    out: Path | None = None
-    overwrite: bool = False
     tolerance: Length | None = None
     scale: bool = False
 
@@ -427,7 +432,7 @@ class Merge(JsonLines, Seed, Threads, Edited):
     voxel: Length | None = None
 
 
-class Locate(Json, Threads, Edited, Selection):
+class Locate(Written, Json, Threads, Edited, Selection):
     """Locate a frame, a clip or a cloud in a finished result.
 
     RESULT is the --out of `tofuse run` or `tofuse merge`; its recording must still be where it was.
@@ -441,8 +446,6 @@ class Locate(Json, Threads, Edited, Selection):
         what is to be located
     out : DIR
         folder for the poses (none)
-    overwrite
-        replace an existing one in --out
 
     Exit status
     -----------
@@ -455,11 +458,9 @@ class Locate(Json, Threads, Edited, Selection):
 
     result: Path
     input: str
-    out: Path | None = None
-    overwrite: bool = False
 
 
-class Compare(Json, Threads, Edited):
+class Compare(Written, Json, Threads, Edited):
     """Compare a result with a CAD model, a mesh, a cloud or another result.
 
     Both are registered, and the result's deviation from the reference's surface is mapped, with its
@@ -481,8 +482,6 @@ class Compare(Json, Threads, Edited):
         unit of the reference's file (default: m or mm, by its extent)
     out : DIR
         folder for the map of deviations and the report (none)
-    overwrite
-        replace an existing one in --out
 
     Exit status
     -----------
@@ -500,11 +499,9 @@ class Compare(Json, Threads, Edited):
     accuracy: Length | None = None
     guess: Path | None = None
     unit: Literal["mm", "cm", "m"] | None = None
-    out: Path | None = None
-    overwrite: bool = False
 
 
-class Repeat(Json, Threads, Edited):
+class Repeat(Written, Json, Threads, Edited):
     """Compare results of the same place: repeatability, and whether their bounds hold.
 
     Results in the same folder are of one session.
@@ -515,8 +512,6 @@ class Repeat(Json, Threads, Edited):
         two or more results; the first one is the reference
     out : DIR
         folder for the tables (none)
-    overwrite
-        replace an existing one in --out
 
     Exit status
     -----------
@@ -527,11 +522,9 @@ class Repeat(Json, Threads, Edited):
     home = "tofuse.apps.cli.comparing"
 
     results: list[Path]
-    out: Path | None = None
-    overwrite: bool = False
 
 
-class Card(Json, Edited):
+class Card(Written, Json, Edited):
     """Collect what results of one camera say about it, and whether it drifts.
 
     Attributes
@@ -540,8 +533,6 @@ class Card(Json, Edited):
         results of one camera; their recordings must still be at their paths
     out : DIR
         folder for card.html and card.json (none)
-    overwrite
-        replace an existing card in --out
 
     Exit status
     -----------
@@ -553,8 +544,6 @@ class Card(Json, Edited):
     home = "tofuse.apps.cli.comparing"
 
     results: list[Path]
-    out: Path | None = None
-    overwrite: bool = False
 
 
 class RigOptions(Json, Threads):
