@@ -41,7 +41,7 @@ def shapes(points, k, origin=(0.0, 0.0, 0.0)):
     points = np.asarray(points, float)
     index, _ = KdTree(points).neighbours(points, k)
     n = len(points)
-    out = np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n)
+    out = np.empty((n, 3)), np.empty(n), np.empty(n)
     local_shapes(points, index, points, np.array(origin), *out)
     return index, out
 
@@ -49,7 +49,7 @@ def shapes(points, k, origin=(0.0, 0.0, 0.0)):
 def test_normals_are_plane_fits_facing_origin():
     r = np.random.default_rng(0)
     points = r.normal(size=(300, 3)) * [1, 1, 0.1] + np.array([0, 0, 3])
-    index, (normals, _, _, roughness) = shapes(points, 10)
+    index, (normals, _, roughness) = shapes(points, 10)
     for i in range(300):
         near = points[index[i]]
         values, vectors = np.linalg.eigh(np.cov(near.T, bias=True))
@@ -58,21 +58,10 @@ def test_normals_are_plane_fits_facing_origin():
         np.testing.assert_allclose(roughness[i], np.sqrt(values[0] / values[1]), atol=1e-9)
 
 
-def test_curvature_of_sphere_is_inverse_radius():
-    r = np.random.default_rng(1)
-    ball = 0.5 * units(r, 4000)
-    _, (_, outside, _, _) = shapes(ball + np.array([0, 0, 3]), 20, origin=(0, 0, 3 - 1e6))
-    front = ball[:, 2] < -0.1
-    np.testing.assert_allclose(np.median(outside[front]), 2.0, rtol=0.02)
-    # Seen from inside it is concave.
-    _, (_, inside, _, _) = shapes(ball, 20)
-    np.testing.assert_allclose(np.median(inside), -2.0, rtol=0.02)
-
-
 def test_sheet_border_has_wide_angular_gap():
     x, y = np.meshgrid(np.arange(20.0), np.arange(20.0))
     sheet = np.column_stack([x.ravel(), y.ravel(), np.full(400, 9.0)])
-    _, (_, _, gap, roughness) = shapes(sheet, 9)
+    _, (_, gap, roughness) = shapes(sheet, 9)
     edge = (x == 0) | (x == 19) | (y == 0) | (y == 19)
     assert np.rad2deg(gap[~edge.ravel()]).max() < 91
     assert np.rad2deg(gap[edge.ravel()]).min() > 135
@@ -80,9 +69,8 @@ def test_sheet_border_has_wide_angular_gap():
 
 
 def test_collinear_points_have_no_normal():
-    _, (normals, curvature, gap, _) = shapes(np.outer(np.arange(20.0), [1, 2, 3]), 6)
+    _, (normals, gap, _) = shapes(np.outer(np.arange(20.0), [1, 2, 3]), 6)
     assert np.isnan(normals).all()
-    assert np.isnan(curvature).all()
     assert (gap == 2 * np.pi).all()
 
 

@@ -21,7 +21,7 @@ from tofuse.lab.methods.comprehensive import Cicp, Comprehensive
 from tofuse.lab.methods.implicit import Implicit
 from tofuse.lab.methods.least_squares_matching import LeastSquaresMatching
 from tofuse.lab.methods.ndt import Ndt
-from tofuse.lab.methods.neighbourhoods import neighbourhood
+from tofuse.lab.methods.neighbourhoods import mean_curvature, neighbourhood
 from tofuse.lab.methods.robust_metrics import Graduated, estimate_shape
 from tofuse.lab.methods.squared_distance import SquaredDistance, approximant
 
@@ -198,6 +198,21 @@ def test_principal_curvatures_of_cylinder():
     assert abs(np.median(k[:, 1])) < 0.15
     along = np.abs(bending.directions[inner, 1, 1])
     assert np.median(along) > 0.99
+
+
+def test_mean_curvature_of_sphere_is_inverse_radius():
+    ball = 0.5 * directions(4000, 1)
+    front = ball[:, 2] < -0.1
+    far = CloudFrame(0, 0.0, ball.astype(np.float32), origin=np.array([0, 0, -1e6]))
+    outside = mean_curvature(Points.of(far, np.arange(4000)))
+    np.testing.assert_allclose(np.median(outside[front]), 2.0, rtol=0.02)
+    # Seen from inside it is concave.
+    inside = mean_curvature(points_of(ball))
+    np.testing.assert_allclose(np.median(inside), -2.0, rtol=0.02)
+
+
+def test_mean_curvature_of_line_is_undetermined():
+    assert np.isnan(mean_curvature(points_of(np.outer(np.arange(20.0), [1, 2, 3])))).all()
 
 
 def test_imls_is_nearer_to_surface_than_plane_of_nearest_point():

@@ -2,7 +2,7 @@
 
 `Icp` matches, rejects and moves until it stops; `algorithm_1` is that of the thesis and
 `CoarseToFine` a robust default for clouds. `interfaces` says what a part is, `icp_parts` and
-`surface_metrics` hold the common ones, and `surface_shape` gives normals and curvature.
+`surface_metrics` hold the common ones, and `surface_shape` gives normals and edges.
 """
 
 from typing import TYPE_CHECKING

@@ -298,7 +298,7 @@ def symmetric_eigen(A: Float64, values: Float64, vectors: Float64) -> None:
 
 
 @kernel
-def _moments(points: Float64, index: Int64, mean: Float64, C: Float64) -> int:
+def moments(points: Float64, index: Int64, mean: Float64, C: Float64) -> int:
     """Centroid (3,), covariance (3, 3) and number of the points `index`, up to the first -1."""
     count = 0
     mean[:] = 0.0
@@ -323,53 +323,6 @@ def _moments(points: Float64, index: Int64, mean: Float64, C: Float64) -> int:
             C[a, b] /= count
             C[b, a] = C[a, b]
     return count
-
-
-@kernel
-def _mean_curvature(
-    points: Float64, index: Int64, count: int, centre: Float64, u: Float64, v: Float64, n: Float64
-) -> float:
-    """Mean curvature of ``h = (a x^2 + 2 b x y + c y^2) / 2 + d x + e y + f`` fitted to points."""
-    M = np.zeros((6, 7))
-    f = np.ones(6)
-    for k in range(count):
-        x = 0.0
-        y = 0.0
-        h = 0.0
-        for a in range(3):
-            offset = points[index[k], a] - centre[a]
-            x += offset * u[a]
-            y += offset * v[a]
-            h += offset * n[a]
-        f[0] = x * x / 2
-        f[1] = x * y
-        f[2] = y * y / 2
-        f[3] = x
-        f[4] = y
-        for a in range(6):
-            for b in range(6):
-                M[a, b] += f[a] * f[b]
-            M[a, 6] += f[a] * h
-    # Gaussian elimination; units differ, so each pivot has its own scale.
-    scale = np.empty(6)
-    for a in range(6):
-        scale[a] = M[a, a]
-    for a in range(6):
-        if not M[a, a] > 1e-9 * scale[a]:
-            return np.nan
-        for b in range(a + 1, 6):
-            w = M[b, a] / M[a, a]
-            for c in range(a, 7):
-                M[b, c] -= w * M[a, c]
-    for a in range(5, -1, -1):
-        for b in range(a + 1, 6):
-            M[a, 6] -= M[a, b] * M[b, 6]
-        M[a, 6] /= M[a, a]
-    p = M[3, 6]
-    q = M[4, 6]
-    numerator = (1 + q * q) * M[0, 6] - 2 * p * q * M[1, 6] + (1 + p * p) * M[2, 6]
-    # Positive if the surface bulges towards the side that the normal points to.
-    return -numerator / (2 * (1 + p * p + q * q) ** 1.5)
 
 
 @kernel
@@ -410,28 +363,25 @@ def local_shapes(
     centres: Float64,
     origin: Float64,
     normals: Float64,
-    curvature: Float64,
     gap: Float64,
     roughness: Float64,
 ) -> None:
     """Fit the surface around each of the `centres` (m, 3) to its neighbours ``points[index[i]]``.
 
     `index` (m, k) is -1 after the last neighbour. Writes unit normals (m, 3) towards `origin` (3,),
-    NaN where the neighbours lie on a line; the mean curvature (m,) in 1/m, positive where the
-    surface bulges towards `origin`, NaN where it is not determined; the widest angle `gap` (m,) in
-    rad around the centre without a neighbour; and the ratio (m,) of the neighbours' rms extents
-    across the plane and along its shorter side.
+    NaN where the neighbours lie on a line; the widest angle `gap` (m,) in rad around the centre
+    without a neighbour; and the ratio (m,) of the neighbours' rms extents across the plane and
+    along its shorter side.
     """
     mean = np.empty(3)
     C = np.empty((3, 3))
     values = np.empty(3)
     vectors = np.empty((3, 3))
     for i in range(len(centres)):
-        count = _moments(points, index[i], mean, C)
+        count = moments(points, index[i], mean, C)
         symmetric_eigen(C, values, vectors)
         if count < 3 or not values[1] > _LINE_RATIO * values[2]:
             normals[i, :] = np.nan
-            curvature[i] = np.nan
             gap[i] = 2 * math.pi
             roughness[i] = np.nan
             continue
@@ -444,5 +394,4 @@ def local_shapes(
             normals[i, a] = sign * vectors[a, 0]
         u = vectors[:, 2].copy()
         v = vectors[:, 1].copy()
-        curvature[i] = _mean_curvature(points, index[i], count, mean, u, v, normals[i])
         gap[i] = _widest_gap(points, index[i], count, centres[i], u, v)

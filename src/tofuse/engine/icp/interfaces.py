@@ -33,7 +33,7 @@ class Points:
     points
         (n, 3) m, in the view's frame.
     neighbours
-        Number of points of each plane fit, if normals or curvature are needed.
+        Number of points of each plane fit, if normals are needed.
     """
 
     view: Frame
@@ -53,7 +53,7 @@ class Points:
 
     @cached_property
     def shape(self) -> Shape:
-        """Curvature and boundary of the view's surface at the points."""
+        """The view's surface at the points."""
         return shape_at(self.view, self.index, self.neighbours)
 
     @cached_property

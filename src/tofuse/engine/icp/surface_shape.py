@@ -1,4 +1,4 @@
-"""Normals, curvature and edges of a view's surface, from the neighbours of its points.
+"""Normals and edges of a view's surface, from the neighbours of its points.
 
 They are computed at most once for each view and number of neighbours, over all of its points:
 registrations against the same view share them.
@@ -33,9 +33,6 @@ class Shape:
     ----------
     normals
         (n, 3) unit normals of fitted planes, towards the sensor; NaN where points lie on a line.
-    curvature
-        (n,) mean curvature in 1/m, positive where the surface bulges towards the sensor; NaN where
-        undetermined.
     boundary
         (n,) True where the surface ends: an empty angle of 135 degrees or more round the point.
     roughness
@@ -44,18 +41,12 @@ class Shape:
     """
 
     normals: Float64
-    curvature: Float64
     boundary: Bool
     roughness: Float64
 
     def at(self, index: Int64) -> Shape:
         """Return the shape at a subset of the points."""
-        return Shape(
-            self.normals[index],
-            self.curvature[index],
-            self.boundary[index],
-            self.roughness[index],
-        )
+        return Shape(self.normals[index], self.boundary[index], self.roughness[index])
 
 
 @dataclass(eq=False)
@@ -105,7 +96,7 @@ def _fit(view: Frame, tree: KdTree, index: Int64, neighbours: int) -> Shape:
     neighbour_index, _ = tree.neighbours(centres, neighbours)
     n = len(index)
     normals = np.empty((n, 3))
-    curvature, gap, roughness = np.empty(n), np.empty(n), np.empty(n)
+    gap, roughness = np.empty(n), np.empty(n)
     origin = np.asarray(view.origin, np.float64)
 
     def work(a: int, b: int) -> None:
@@ -115,10 +106,9 @@ def _fit(view: Frame, tree: KdTree, index: Int64, neighbours: int) -> Shape:
             centres[a:b],
             origin,
             normals[a:b],
-            curvature[a:b],
             gap[a:b],
             roughness[a:b],
         )
 
     run_chunks(work, n)
-    return Shape(normals, curvature, gap >= _BOUNDARY_GAP, roughness)
+    return Shape(normals, gap >= _BOUNDARY_GAP, roughness)

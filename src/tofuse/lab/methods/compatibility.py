@@ -11,6 +11,7 @@ import numpy as np
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.icp import icp_kernels, interfaces
 from tofuse.engine.parts import part
+from tofuse.lab.methods.neighbourhoods import mean_curvature
 
 
 @part("rejector", "normal", label="validated")
@@ -56,8 +57,8 @@ class CurvatureCompatibility(Bounded, interfaces.Rejector):
         self, matches: interfaces.Matches, alignment: interfaces.Alignment
     ) -> interfaces.Matches:
         """See `Rejector.reject`."""
-        a = alignment.source.shape.curvature[matches.source]
-        b = alignment.target.shape.curvature[matches.target]
+        a = mean_curvature(alignment.source)[matches.source]
+        b = mean_curvature(alignment.target)[matches.target]
         return matches.keep(np.abs(a - b) * alignment.resolution <= self.tolerance)
 
 

@@ -16,6 +16,7 @@ from tofuse.engine.icp import icp_kernels, interfaces
 from tofuse.engine.parts import part
 from tofuse.lab.methods.cloud_search_kernels import grid_search
 from tofuse.lab.methods.featured_tree import FeaturedKdTree
+from tofuse.lab.methods.neighbourhoods import mean_curvature
 
 Invariant = Literal["curvature", "moments"]
 
@@ -247,7 +248,7 @@ class _InvariantSearch:
         columns = []
         for feature in self.options.features:
             if feature == "curvature":
-                columns.append(points.shape.curvature[:, None] * resolution)
+                columns.append(mean_curvature(points)[:, None] * resolution)
             else:
                 radius = self.options.radius * resolution
                 moments = FeaturedKdTree(points.view.points).moments(points.points, radius)

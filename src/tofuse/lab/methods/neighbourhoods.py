@@ -10,7 +10,8 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.geometry import KdTree
-from tofuse.engine.icp import interfaces
+from tofuse.engine.icp import interfaces, surface_shape
+from tofuse.lab.methods.curvature_kernels import mean_curvatures
 
 # A quadric through a point has five parameters; the point itself is its first neighbour.
 _MIN_NEIGHBOURS = 6
@@ -102,6 +103,23 @@ def neighbourhood(points: interfaces.Points) -> Neighbourhood:
     if points not in _cache:
         _cache[points] = Neighbourhood(points)
     return _cache[points]
+
+
+_mean_curvatures: WeakKeyDictionary[interfaces.Points, Float64] = WeakKeyDictionary()
+
+
+def mean_curvature(points: interfaces.Points) -> Float64:
+    """Return the (n,) mean curvature in 1/m, cached for each set of points.
+
+    It is positive where the surface bulges towards the sensor, and NaN where undetermined.
+    """
+    if points not in _mean_curvatures:
+        view, count = points.view, points.neighbours
+        index, _ = surface_shape.tree_of(view).neighbours(points.points, count)
+        _mean_curvatures[points] = mean_curvatures(
+            view.points.astype(np.float64), index, points.shape.normals
+        )
+    return _mean_curvatures[points]
 
 
 def with_normals(
