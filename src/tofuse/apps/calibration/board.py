@@ -187,8 +187,7 @@ def board_pose(camera: Camera, corners: Float64, board: Board) -> tuple[Float64,
         rvec, tvec = cv2.solvePnPRefineLM(points, observed, np.eye(3), None, rvec, tvec)
     except cv2.error:
         return None
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(rvec)[0], tvec.ravel()
+    T = se3.pose(cv2.Rodrigues(rvec)[0], tvec.ravel())
     errors = camera.project(se3.transform(T, points)) - corners
     rms = float(np.sqrt((errors**2).sum(1).mean()))
     return (T, rms) if np.isfinite(rms) else None

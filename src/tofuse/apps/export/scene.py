@@ -15,6 +15,7 @@ from tofuse.apps.results import read_cloud, read_mesh, run_json
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.fusion import GeometryRecord
+from tofuse.engine.geometry import se3
 
 # From axes with y up (glTF) to axes with z up (ROS, REP 103).
 _R_ZUP_YUP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -56,11 +57,10 @@ class Scene:
             If its files are damaged.
         """
         path = result / "run.json"
-        T_zup_world = np.eye(4)
         with run_json.opened(result) as run:
             indices, poses = run_json.main_poses(result, run)
             times = [float(frame["timestamp"]) for frame in run_json.frames_in_main_model(run)]
-            T_zup_world[:3, :3] = _R_ZUP_YUP @ run_json.rotation_up_world(run, path)
+            T_zup_world = se3.pose(_R_ZUP_YUP @ run_json.rotation_up_world(run, path))
             shift = run_json.shift_of(run, path)
         rows = np.array(indices, np.intp)
         return cls(result, every, np.array(times), rows, poses, T_zup_world, shift)

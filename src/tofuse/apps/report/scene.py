@@ -14,6 +14,7 @@ from tofuse.apps.report.packing import normal_bytes, pack, quantized
 from tofuse.apps.results import QUALITY, viridis
 from tofuse.engine.arrays import Float32, Float64, Int32, Intp, UInt8, UInt16
 from tofuse.engine.fusion import Cloud, Mesh, Textured, drawing
+from tofuse.engine.geometry import se3
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.images import jpeg_bytes
 
@@ -123,8 +124,7 @@ class Scene:
 
     def view_rotation(self, R: Float64) -> Scene:
         """Return the scene in the axes given by the rows of R (3, 3)."""
-        T = np.eye(4)
-        T[:3, :3] = R
+        T = se3.pose(R)
         return replace(
             self,
             points=self.points @ R.T,

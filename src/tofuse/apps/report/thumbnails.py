@@ -215,8 +215,7 @@ def framing(
     -------
     T_view_world (4, 4), and pixels per metre.
     """
-    T = np.eye(4)
-    T[:3, :3] = view_rotation(yaw, pitch)
+    T = se3.pose(view_rotation(yaw, pitch))
     if len(points) == 0:
         return T, 1.0
     low, high = np.percentile(points @ T[:3, :3].T, [0.2, 99.8], axis=0)

@@ -174,8 +174,7 @@ def _initial_estimate(
     d = (B[:, :3, 3] @ R.T - A[:, :3, 3]).ravel()
     # Prior for directions that the motion does not constrain: the cameras are close together.
     t = np.linalg.solve(M.T @ M + 1e-4 * len(A) * np.eye(3), M.T @ d)
-    X = np.eye(4)
-    X[:3, :3], X[:3, 3] = R, t
+    X = se3.pose(R, t)
     return X, median_pose(T_a @ X @ se3.inverse(T_b))
 
 

@@ -57,8 +57,7 @@ def cloud_information(
     if pairs is None:
         size = max(float(np.linalg.norm(np.ptp(source.view.points, axis=0))), source.size)
         return np.diag((_UNBOUNDED * np.r_[[size] * 3, [1.0] * 3]) ** -2.0)
-    T_centre_source = np.eye(4)
-    T_centre_source[:3, 3] = -pairs.centre
+    T_centre_source = se3.translation(-pairs.centre)
     # From the perturbation about the origin to that about the centroid, in units in which rotations
     # move the points as far as translations.
     unit = np.array([1, 1, 1, *[1 / pairs.size] * 3])

@@ -16,7 +16,7 @@ import numpy as np
 from tofuse.engine.arrays import Float32, Float64, Intp
 from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
-from tofuse.engine.geometry import KdTree
+from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.icp import reduced, spacing
 
 # Maximum number of points, of samples among them, and of neighbours for the local density.
@@ -223,8 +223,7 @@ def as_image(view: Frame, viewpoint: Viewpoint) -> tuple[RangeFrame, Float64] | 
     if isinstance(view, RangeFrame):
         return view, np.eye(4)
     points = view.points.astype(np.float64) - viewpoint.origin
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = _axes(points), viewpoint.origin
+    T = se3.pose(_axes(points), viewpoint.origin)
     camera_points = points @ T[:3, :3]
     camera = _camera_of(camera_points, viewpoint.spacing)
     if camera is None:

@@ -6,6 +6,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.geometry import se3
 
 # Number of sampled vertices, and of candidate planes through them.
 _MAX_POINTS, _MAX_CANDIDATES = 4000, 150
@@ -34,9 +35,7 @@ _CHUNK_SIZE = 500_000
 
 def T_up_world(mesh: Mesh | None, poses: Float64, up: Float64 | None = None) -> Float64:
     """Return the rotation of `upright` about the world's origin, as (4, 4)."""
-    T = np.eye(4)
-    T[:3, :3] = upright(mesh, poses, up)
-    return T
+    return se3.pose(upright(mesh, poses, up))
 
 
 def upright(mesh: Mesh | None, poses: Float64, up: Float64 | None = None) -> Float64:

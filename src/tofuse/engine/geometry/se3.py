@@ -141,11 +141,16 @@ def about(centre: ArrayLike, T: ArrayLike) -> Float64:
     return np.asarray(translation(centre) @ T @ translation(-centre)) if centre.any() else T
 
 
+def pose(R: ArrayLike, t: ArrayLike = 0.0) -> Float64:
+    """Return the motion (4, 4) with a rotation matrix (3, 3) and a translation (3,)."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    return T
+
+
 def translation(t: ArrayLike) -> Float64:
     """Return the translation (4, 4) by t (3,)."""
-    T = np.eye(4)
-    T[:3, 3] = t
-    return T
+    return pose(np.eye(3), t)
 
 
 def point_jacobian(points: ArrayLike) -> Float64:

@@ -60,8 +60,7 @@ class Problem:
         down = down / np.linalg.norm(down)
         x = np.cross(np.eye(3)[np.argmin(np.abs(down))], down)
         x /= np.linalg.norm(x)
-        T = np.eye(4)
-        T[:3, :3] = np.stack([x, np.cross(down, x), down], axis=1)
+        T = se3.pose(np.stack([x, np.cross(down, x), down], axis=1))
         return np.concatenate([poses, T[None]])
 
     def errors(self, poses: Float64) -> tuple[Float64, Float64]:

@@ -77,8 +77,7 @@ class Remapping:
         return self._project(T, along=False)
 
     def _project(self, T: Float64, *, along: bool) -> Float64:
-        T_centre_source = np.eye(4)
-        T_centre_source[:3, 3] = -self.centre
+        T_centre_source = se3.translation(-self.centre)
         scale = np.array([1, 1, 1, self.size, self.size, self.size])
         scaled = (self.directions @ se3.adjoint(T_centre_source).T) * scale
         basis = np.linalg.svd(scaled, full_matrices=False)[2]

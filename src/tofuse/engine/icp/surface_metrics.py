@@ -91,9 +91,7 @@ class SurfacePairs:
 
     def to_origin(self, H: Float64) -> Float64:
         """Transform information (6, 6) about the centre to the source's origin."""
-        T_centre_source = np.eye(4)
-        T_centre_source[:3, 3] = -self.centre
-        adjoint = se3.adjoint(T_centre_source)
+        adjoint = se3.adjoint(se3.translation(-self.centre))
         H = adjoint.T @ H @ adjoint
         return (H + H.T) / 2
 
@@ -123,8 +121,7 @@ def surface_pairs(matches: Matches, alignment: Alignment, *, source: bool = Fals
     """
     i, j = matches.source, matches.target
     T = alignment.T_target_source
-    rotation = np.eye(4)
-    rotation[:3, :3] = T[:3, :3].T
+    rotation = se3.pose(T[:3, :3].T)
     p = alignment.source.points[i]
     residual = transform_points(rotation, alignment.transformed[i] - alignment.target.points[j])
     target_normals = transform_points(rotation, alignment.target.normals[j])
@@ -247,9 +244,7 @@ def unobservable_directions(pairs: SurfacePairs, variance: float) -> Float64:
         pairs.points, pairs.target_normals, pairs.source_normals, pairs.weight, directions
     )
     constrained = (values > 1) & (cross > _MIN_SIGNAL_FRACTION * plain)
-    T_source_centre = np.eye(4)
-    T_source_centre[:3, 3] = pairs.centre
-    unobservable = directions[~constrained] @ se3.adjoint(T_source_centre).T
+    unobservable = directions[~constrained] @ se3.adjoint(se3.translation(pairs.centre)).T
     return unobservable / np.linalg.norm(unobservable, axis=1, keepdims=True)
 
 

@@ -323,9 +323,7 @@ def _lens(
         tangential_factor=_MODELS[model],
         **{name: float(value) for name, value in values.items()},
     )
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
-    return lens, se3.orthonormalise(se3.check_pose(T, where=f"{where}: Rt"))
+    return lens, se3.orthonormalise(se3.check_pose(se3.pose(R, t), where=f"{where}: Rt"))
 
 
 def _get(data: Any, *keys: str) -> Any:

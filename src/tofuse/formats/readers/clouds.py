@@ -11,6 +11,7 @@ from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.fusion import GeometryRecord
+from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
 from tofuse.formats.geometry import Pcd, read_pcd
@@ -191,7 +192,4 @@ def read_pose(path: Path) -> Float64:
             [-cx * sy * cz + sx * sz, cx * sy * sz + sx * cz, cx * cy],
         ]
     )
-    T = np.eye(4)
-    T[:3, :3] = FLIP @ R @ FLIP
-    T[:3, 3] = FLIP @ numbers[:3] * CENTIMETRE
-    return T
+    return se3.pose(FLIP @ R @ FLIP, FLIP @ numbers[:3] * CENTIMETRE)

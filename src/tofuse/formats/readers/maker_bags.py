@@ -179,8 +179,8 @@ class RealSenseSource(MakerBagSource):
             try:
                 if hasattr(message, "data"):
                     text = dict(p.partition("=")[::2] for p in str(message.data).split(";"))
-                    T[:3, :3] = _numbers(text["rotation"]).reshape(3, 3).T
-                    T[:3, 3] = _numbers(text["translation"])
+                    R = _numbers(text["rotation"]).reshape(3, 3).T
+                    T = se3.pose(R, _numbers(text["translation"]))
                 elif message is not None:
                     q, t = message.rotation, message.translation
                     T = quaternion.to_pose([q.x, q.y, q.z, q.w], [t.x, t.y, t.z])
@@ -344,8 +344,7 @@ class OrbbecSource(MakerBagSource):
         # Single precision, and not orthonormalised.
         if not (np.abs(R @ R.T - np.eye(3)).max() < 0.05 and np.linalg.det(R) > 0):
             raise InputError("has no pose relative to colour", where=where)
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, self.profile.translation_m
+        T = se3.pose(R, self.profile.translation_m)
         return camera_file.ColorCamera(lens, se3.check_pose(se3.orthonormalise(T), where=where))
 
     def _profile(self, topic: str) -> _Profile:
