@@ -199,8 +199,7 @@ def aligned(
     tried = np.flatnonzero(right[0]) if to_first else np.arange(len(estimate))
     best = min(tried, key=lambda i: (-count[i], spread[i], i))
     T = truth[right[best]] @ se3.inverse(estimate[right[best]])
-    out = np.eye(4)
-    out[:3, :3] = mean_rotation(T[:, :3, :3])
+    out = se3.pose(mean_rotation(T[:, :3, :3]))
     # Average over camera positions, not over positions of the world origin.
     centre = estimate[right[best]][:, :3, 3].mean(0)
     out[:3, 3] = truth[right[best]][:, :3, 3].mean(0) - out[:3, :3] @ centre

@@ -269,8 +269,7 @@ def _tunnel(assembly: Assembly, _rng: np.random.Generator) -> None:
     for k in range(12):
         z = 2.0 * k
         profile += [(1.2, z + 1.7), (1.1, z + 1.72), (1.1, z + 1.9), (1.2, z + 1.92)]
-    T = np.eye(4)
-    T[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
+    T = se3.pose([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     T[0, 3] = -4
     assembly.add(WALL, meshes.inside_out(meshes.lathe(profile, 48)).transformed(T))
 
@@ -307,8 +306,7 @@ def _bathroom(assembly: Assembly, _rng: np.random.Generator) -> None:
     """Add a tiled room of 2.0 x 1.8 m with a bath, a basin, a toilet and a cupboard."""
     shell(assembly, (-1.0, -0.9, 0), (1.0, 0.9, 2.4), [TILES] * 4, TILES, PLASTER)
     assembly.add(PLASTER, meshes.box_between((-1.0, 0.2, 0), (0.9, 0.9, 0.55)))
-    raised = np.eye(4)
-    raised[:3, 3] = 0.7, -0.5, 0.8
+    raised = se3.translation((0.7, -0.5, 0.8))
     assembly.add(PLASTER, meshes.superellipsoid((0.5, 0.4, 0.2), (0.6, 0.8)).transformed(raised))
     toilet = meshes.superellipsoid((0.4, 0.6, 0.7), (0.8, 0.9))
     assembly.add(PLASTER, toilet.transformed(placed((-0.4, -0.6), 0.0)))

@@ -121,8 +121,7 @@ def test_georeferenced_and_local_cloud_are_registered(tmp_path, capfd) -> None:
     write_ply(tmp_path / "map.ply", GeometryRecord(target))
     write_ply(tmp_path / "local.ply", GeometryRecord(source))
     _, output = register_json(capfd, tmp_path / "local.ply", tmp_path / "map.ply")
-    shift = np.eye(4)
-    shift[:3, 3] = MAP
+    shift = se3.translation(MAP)
     near(output["T_target_source"], shift @ T_SMALL, metres=0.02, degrees=1)
 
 

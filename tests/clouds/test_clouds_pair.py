@@ -64,8 +64,7 @@ def test_large_clouds_are_downsampled():
 
 def test_map_coordinates_keep_precision():
     far = np.array([[500_000.0, 5_000_000, 300]])
-    shift = np.eye(4)
-    shift[:3, 3] = far
+    shift = se3.translation(far)
     T = turn([1, 2, 0.5], 2)
     near = tofuse.register(source_of(relief(3000, 1), T), relief(3000, 0))
     guess = shift @ np.linalg.inv(shift)

@@ -65,8 +65,7 @@ def walk(count: int = 8) -> Float64:
     """(N, 4, 4) true poses above a floor."""
     poses = []
     for k in range(count):
-        T = np.eye(4)
-        T[:3, 3] = 0.08 * k, 0.03 * np.sin(k), 1.4
+        T = se3.translation((0.08 * k, 0.03 * np.sin(k), 1.4))
         turn = se3.exp(
             [0, 0, 0, 0.3 + 0.05 * np.sin(2 * k), 0.05 * np.cos(k), 0.12 * np.sin(k / 2)]
         )

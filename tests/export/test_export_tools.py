@@ -198,10 +198,10 @@ def test_mcap_read_by_its_reader(result: Path) -> None:
 
 
 def matrix(position: dict[str, float], orientation: dict[str, float]) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, :3] = quaternion.to_matrix(np.array([orientation[a] for a in "xyzw"]))
-    T[:3, 3] = [position[a] for a in "xyz"]
-    return T
+    return se3.pose(
+        quaternion.to_matrix(np.array([orientation[a] for a in "xyzw"])),
+        [position[a] for a in "xyz"],
+    )
 
 
 def cloud_of(result: Path) -> GeometryRecord:

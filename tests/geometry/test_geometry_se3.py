@@ -72,8 +72,7 @@ def test_log_and_angle_are_exact_near_pi(axis: np.ndarray) -> None:
         assert abs(se3.angle(R) - angle) < 1e-7
         w = se3.so3_log(R)
         np.testing.assert_allclose(se3.so3_exp(w), R, atol=1e-9)
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, [1, 2, 3]
+        T = se3.pose(R, [1, 2, 3])
         np.testing.assert_allclose(se3.exp(se3.log(T)), T, atol=1e-7)
 
 
@@ -104,9 +103,7 @@ def test_functions_broadcast_over_stacks() -> None:
 
 
 def test_transform_maps_points_from_b_to_a() -> None:
-    T_a_b = np.eye(4)
-    T_a_b[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
-    T_a_b[:3, 3] = [10, 0, 0]
+    T_a_b = se3.pose([[0, -1, 0], [1, 0, 0], [0, 0, 1]], [10, 0, 0])
     np.testing.assert_allclose(
         se3.transform(T_a_b, [[1, 0, 0], [0, 2, 0]]), [[10, 1, 0], [8, 0, 0]]
     )

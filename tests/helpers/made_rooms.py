@@ -41,10 +41,7 @@ OTHER: tuple[Box, ...] = (
 
 def at(x: float, z: float, yaw: float, pitch: float = 0.3, y: float = 0.0) -> Float64:
     """T_world_camera (4, 4) of a camera rotated by `yaw` that looks down by `pitch`."""
-    T = np.eye(4)
-    T[:3, :3] = se3.so3_exp([0, yaw, 0]) @ se3.so3_exp([-pitch, 0, 0])
-    T[:3, 3] = x, y, z
-    return T
+    return se3.pose(se3.so3_exp([0, yaw, 0]) @ se3.so3_exp([-pitch, 0, 0]), [x, y, z])
 
 
 def seen(

@@ -45,10 +45,7 @@ def seen(T_world_camera, boxes=FURNITURE, sigma=0.004, seed=0, walls=True):
 
 def camera(x, z, yaw, pitch=-0.35):
     """A pose at the height of the origin; a negative pitch looks down."""
-    T = np.eye(4)
-    T[:3, :3] = se3.so3_exp([0, yaw, 0]) @ se3.so3_exp([pitch, 0, 0])
-    T[:3, 3] = x, 0.0, z
-    return T
+    return se3.pose(se3.so3_exp([0, yaw, 0]) @ se3.so3_exp([pitch, 0, 0]), [x, 0.0, z])
 
 
 def error(found, true):

@@ -249,8 +249,7 @@ def test_normal_compatibility_uses_rotated_normals():
     target = with_normals(np.tile([0, 0, -1], (5, 1)))
     a = aligned(source, target)
     assert list(NormalCompatibility().reject(one_to_one(5), a).source) == [0, 1]
-    T = np.eye(4)
-    T[:3, :3] = se3.so3_exp([0, np.deg2rad(45), 0])
+    T = se3.pose(se3.so3_exp([0, np.deg2rad(45), 0]))
     kept = NormalCompatibility(np.deg2rad(20)).reject(one_to_one(5), aligned(source, target, T))
     assert list(kept.source) == [1, 2]
 

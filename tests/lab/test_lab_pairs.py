@@ -124,8 +124,7 @@ def test_ls3d_with_intensity_does_not_slide_along_wall():
         light = 100 + 40 * np.sin(9 * p[:, 0]) * np.cos(7 * p[:, 1])
         return view(p, T, amplitude=light.astype(np.float32))
 
-    T = np.eye(4)
-    T[:3, 3] = [0.03, -0.02, 0.01]
+    T = se3.translation([0.03, -0.02, 0.01])
     plain, lit = (
         LeastSquaresMatching(0.02, intensity=intensity).register(
             wall(1, T), wall(0, np.eye(4)), np.eye(4), rng()

@@ -20,9 +20,10 @@ def grid(side: int, noise: float, seed: int) -> PoseGraph:
     for row in range(side):
         lane = range(side) if row % 2 == 0 else range(side - 1, -1, -1)
         for column in lane:
-            T = np.eye(4)
-            T[:3, :3] = se3.so3_exp([0.0, 0.0 if row % 2 == 0 else np.pi - 0.01, 0.0])
-            T[:3, 3] = [column, 0.1 * np.sin(column), row]
+            T = se3.pose(
+                se3.so3_exp([0.0, 0.0 if row % 2 == 0 else np.pi - 0.01, 0.0]),
+                [column, 0.1 * np.sin(column), row],
+            )
             truth.append(T)
     n = side * side
     place = {(round(T[0, 3]), round(T[2, 3])): k for k, T in enumerate(truth)}

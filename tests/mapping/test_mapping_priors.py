@@ -67,9 +67,9 @@ def test_reference_poses_are_used_for_comparison_only(recording) -> None:
 
 def test_device_poses_give_gravity_direction(recording) -> None:
     # Its world has y up, and is rotated about y and translated relative to the result's.
-    T_device_world = np.eye(4)
-    T_device_world[:3, :3] = [[0.0, 0.0, 1.0], [-0.6, -0.8, 0.0], [0.8, -0.6, 0.0]]
-    T_device_world[:3, 3] = [3.0, 1.0, -2.0]
+    T_device_world = se3.pose(
+        [[0.0, 0.0, 1.0], [-0.6, -0.8, 0.0], [0.8, -0.6, 0.0]], [3.0, 1.0, -2.0]
+    )
     phone = by_phone(recording, T_device_world @ recording.reference)
     n = len(recording)
     poses = recording.reference @ se3.exp(np.tile([0.1, 0, 0, 0, 0, 0], (n, 1)))

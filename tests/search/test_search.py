@@ -117,8 +117,7 @@ def test_poses_of_grid_are_scored_in_both_directions():
     most = 0
     for a in range(6):
         for b in range(4):
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = rotations[a], moves[b]
+            T = se3.pose(rotations[a], moves[b])
             there, w, d = scored(*source, lights[0], *grids[1], T, 0.4)
             back, v, e = scored(*target, lights[1], *grids[0], se3.inverse(T), 0.4)
             w, d = np.append(w, v), np.append(d, -e)

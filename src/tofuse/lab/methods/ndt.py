@@ -124,8 +124,7 @@ class Ndt(Bounded, Registrar):
 
     def _level(self, data: Float64, cells: _Cells, T: Float64) -> tuple[Float64, int, bool]:
         centroid = data.mean(0)
-        T_source_centred = np.eye(4)
-        T_source_centred[:3, 3] = centroid
+        T_source_centred = se3.translation(centroid)
         centred = data - centroid
         radius = max(float(np.sqrt((centred**2).sum(1).mean())), self.resolution)
         units = np.array([1, 1, 1, 1 / radius, 1 / radius, 1 / radius])

@@ -243,8 +243,7 @@ def _pose(
         np.stack([planes[k].normal for k in indices])
         for planes, indices in zip((a, b), zip(*pairs, strict=True), strict=True)
     )
-    T = np.eye(4)
-    T[:3, :3] = _align_normals(weight * source_normals, weight * target_normals, R)
+    T = se3.pose(_align_normals(weight * source_normals, weight * target_normals, R))
     rotated = source_normals @ T[:3, :3].T
     # offset in the target = offset in the source + normal . t
     offsets = np.array([b[j].offset - a[i].offset for i, j in pairs])

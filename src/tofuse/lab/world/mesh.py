@@ -180,9 +180,7 @@ def rod(
     z = (b - a) / length
     x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
     x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
-    T[:3, 3] = a
+    T = se3.pose(np.stack([x, np.cross(z, x), z], 1), a)
     return lathe([(0, 0), (radius, 0), (tip, length), (0, length)], segments).transformed(T)
 
 

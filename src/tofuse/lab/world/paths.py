@@ -20,10 +20,7 @@ def look_at(position: ArrayLike, target: ArrayLike) -> Float64:
     z = z / np.linalg.norm(z)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x = x / np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(z, x), z], 1)
-    T[:3, 3] = p
-    return T
+    return se3.pose(np.stack([x, np.cross(z, x), z], 1), p)
 
 
 def still(T: Float64) -> Path:
