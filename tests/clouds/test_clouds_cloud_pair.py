@@ -9,6 +9,7 @@ import pytest
 
 import tofuse
 from registration_scenes import box_walls, bumpy_ball, turn
+from scanned_flat import scanned
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.clouds import cloud_pair
@@ -39,27 +40,15 @@ from tofuse.lab.world import scene as scenes
 ANYWHERE = se3.exp([1.0, -0.7, 0.4, 1.9, 0.3, -1.0])
 
 
-def scanned(at, heading, count=20_000, seed=0, name="flat"):
-    """A scan with equal angles, z up, at a place of a simulated flat: its pose and points."""
-    built, _ = scenes.build(name, seed=0)
-    rows = int(np.sqrt(count / 2))
-    up, around = np.meshgrid(
-        np.linspace(-1.2, 1.5, rows), np.linspace(-np.pi, np.pi, 2 * rows, False), indexing="ij"
-    )
-    rays = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], -1)
-    rays = rays.reshape(-1, 3)
-    T = se3.exp([0, 0, 0, 0, 0, heading])
-    T[:3, 3] = at
-    distance = built.cast(T[:3, 3], rays @ T[:3, :3].T).distance.astype(float)
-    seen = np.isfinite(distance)
-    distance += np.random.default_rng(seed).normal(0, 0.003, len(distance))
-    return T, (rays[seen] * distance[seen, None]).astype(np.float32)
+def scan(at, heading, seed=0):
+    T, points = scanned(at, heading, seed)
+    return T, points.astype(np.float32)
 
 
 @pytest.fixture(scope="module")
 def scans():
     """Two scans of one room of the flat, from different places."""
-    (T_a, a), (T_b, b) = scanned([-2.6, -2.5, 1.3], 0.4), scanned([-1.6, -2.2, 1.3], 2.6, seed=1)
+    (T_a, a), (T_b, b) = scan([-2.6, -2.5, 1.3], 0.4), scan([-1.6, -2.2, 1.3], 2.6, seed=1)
     return b, a, se3.inverse(T_a) @ T_b
 
 
@@ -363,7 +352,7 @@ def test_clouds_of_different_density(scans):
 
 @pytest.mark.nightly_part
 def test_views_without_overlap_are_rejected(scans):
-    _, elsewhere = scanned([2.5, -2.5, 1.3], 1.0, seed=3)
+    _, elsewhere = scan([2.5, -2.5, 1.3], 1.0, seed=3)
     for source, target, reason in (
         (elsewhere, scans[1], "another pose fits nearly as well"),
         (np.random.default_rng(0).normal(size=(3000, 3)), scans[1], "points of both views"),
@@ -559,7 +548,7 @@ def test_views_are_chained_and_rejected_views_start_components(scans):
 def test_folder_of_scans_becomes_one_model(tmp_path):
     """Through a door, with any heading: neighbours are found, and walls keep their thickness."""
     places = (([-2.6, -2.5, 1.3], 0.4), ([-1.6, -2.2, 1.3], 2.6), ([-0.5, -2.3, 1.3], -1.0))
-    taken = [scanned(at, heading, seed=k) for k, (at, heading) in enumerate(places)]
+    taken = [scan(at, heading, seed=k) for k, (at, heading) in enumerate(places)]
     (tmp_path / "scans").mkdir()
     for k, (_, points) in enumerate(taken):
         write_ply(tmp_path / "scans" / f"{k}.ply", GeometryRecord(points))

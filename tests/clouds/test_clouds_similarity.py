@@ -2,37 +2,24 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 import tofuse
 from registration_scenes import rng, stone
+from scanned_flat import scanned
 from tofuse.engine.geometry import se3
-from tofuse.lab.world import scene as scenes
 
 ANYWHERE = se3.exp([1.0, -0.7, 0.4, 1.9, 0.3, -1.0])
 MAP = np.array([500_000.0, 4_000_000.0, 100.0])
 
 
-def scan(at, heading, seed, noise=0.005, rows=70):
-    """A spherical scan of a simulated flat: pose and points."""
-    built, _ = scenes.build("flat", seed=0)
-    up, around = np.meshgrid(
-        np.linspace(-1.2, 1.5, rows), np.linspace(-np.pi, np.pi, 2 * rows, False), indexing="ij"
-    )
-    rays = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], -1)
-    rays = rays.reshape(-1, 3)
-    T = se3.exp([0, 0, 0, 0, 0, heading])
-    T[:3, 3] = at
-    distance = built.cast(T[:3, 3], rays @ T[:3, :3].T).distance.astype(float)
-    seen = np.isfinite(distance)
-    distance += rng(seed).normal(0, noise, len(distance))
-    return T, rays[seen] * distance[seen, None]
-
-
 @pytest.fixture(scope="module")
 def scans():
     """Two scans of a room from different places, and the pose of the second in the first."""
+    scan = partial(scanned, noise=0.005, rows=70)
     (T_a, a), (T_b, b) = scan([-2.6, -2.5, 1.3], 0.4, 0), scan([-1.6, -2.2, 1.3], 2.6, 1)
     return b, a, se3.inverse(T_a) @ T_b
 

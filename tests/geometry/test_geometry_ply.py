@@ -76,16 +76,9 @@ def test_all_attributes_round_trip(tmp_path: Path) -> None:
     faces = rng.integers(0, 100, (50, 3))
     views = rng.integers(0, 9, 100)
     amplitude = rng.normal(size=100)
-    write_ply(
-        tmp_path / "a.ply",
-        GeometryRecord(
-            points,
-            normals=normals,
-            color=color,
-            scalars={"amplitude": amplitude, "views": views},
-            faces=faces,
-        ),
-    )
+    scalars = {"amplitude": amplitude, "views": views}
+    record = GeometryRecord(points, normals=normals, color=color, scalars=scalars, faces=faces)
+    write_ply(tmp_path / "a.ply", record)
     ply = read_ply(tmp_path / "a.ply")
     np.testing.assert_array_equal(ply.points, points)
     np.testing.assert_array_equal(ply.normals, normals)
@@ -94,16 +87,7 @@ def test_all_attributes_round_trip(tmp_path: Path) -> None:
     np.testing.assert_array_equal(ply.scalars["views"], views)
     np.testing.assert_array_equal(ply.scalars["amplitude"], amplitude)
     first = (tmp_path / "a.ply").read_bytes()
-    write_ply(
-        tmp_path / "a.ply",
-        GeometryRecord(
-            points,
-            normals=normals,
-            color=color,
-            scalars={"amplitude": amplitude, "views": views},
-            faces=faces,
-        ),
-    )
+    write_ply(tmp_path / "a.ply", record)
     assert (tmp_path / "a.ply").read_bytes() == first
 
 

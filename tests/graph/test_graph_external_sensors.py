@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,13 +92,18 @@ def ate(poses: np.ndarray, right: np.ndarray) -> float:
 NODDING = np.array([0, 0, 0, 0.004, 0, 0])
 
 
+def walked(error: np.ndarray, **stated: Any) -> tuple[np.ndarray, PoseGraph]:
+    """The true poses of a walk, and its graph with this error of each step."""
+    right = truth()
+    return right, tracked(right, error, **stated)
+
+
 def solved(graph: PoseGraph, measured: SensorPriors) -> np.ndarray:
     return LevenbergMarquardt().optimise(with_sensors(graph, measured)).graph.poses
 
 
 def test_gravity_removes_roll_and_pitch_drift():
-    right = truth()
-    graph = tracked(right, NODDING, stated=STATED)
+    right, graph = walked(NODDING, stated=STATED)
     measured = measure_all((GravityEdges(),), sensed(gravity=seen_down(right)), graph)
     corrected = solved(graph, measured)
     assert tilt(graph.poses, right) > np.radians(2.5)
@@ -118,8 +124,7 @@ def test_gravity_removes_roll_and_pitch_drift():
 
 def test_accelerated_motion_is_not_taken_for_gravity():
     """For a third of the time the camera is accelerated sideways by a third of g."""
-    right = truth()
-    graph = tracked(right, NODDING, stated=STATED)
+    right, graph = walked(NODDING, stated=STATED)
     lying = seen_down(right)
     lying[20:40, :3] += 0.33 * right[20:40, 0, :3]
     lying[:, :3] /= np.linalg.norm(lying[:, :3], axis=1)[:, None]
@@ -135,8 +140,7 @@ def test_accelerated_motion_is_not_taken_for_gravity():
 
 
 def test_systematic_error_limits_accuracy_of_vertical():
-    right = truth()
-    graph = tracked(right, 0 * NODDING)
+    right, graph = walked(0 * NODDING)
     measured = measure_all(
         (GravityEdges(shared_rad=0.01),), sensed(gravity=seen_down(right)), graph
     )
@@ -161,8 +165,7 @@ def odometer(right: np.ndarray, share: float = 0.01) -> np.ndarray:
 
 
 def test_good_odometry_helps_and_wrong_odometry_is_rejected():
-    right = truth()
-    graph = tracked(right, 0 * NODDING)
+    right, graph = walked(0 * NODDING)
     before = ate(graph.poses, right)
     good = measure_all(
         (OdometryEdges(drift_m=0.001, drift_rad=0.001, relative=0.003),),
@@ -182,8 +185,7 @@ def test_good_odometry_helps_and_wrong_odometry_is_rejected():
 
 def test_odometry_is_weighted_by_its_actual_errors():
     """Several times the stated noise: it is weighted accordingly, and does no harm."""
-    right = truth()
-    graph = tracked(right, 0 * NODDING)
+    right, graph = walked(0 * NODDING)
     noisy = odometer(right, 0.04)
     measured = measure_all((OdometryEdges(),), sensed(noisy), graph)
     record = measured.records[0]
@@ -193,8 +195,7 @@ def test_odometry_is_weighted_by_its_actual_errors():
 
 
 def test_odometry_better_than_stated_gets_more_weight():
-    right = truth()
-    graph = tracked(right, 0 * NODDING)
+    right, graph = walked(0 * NODDING)
     measured = measure_all((OdometryEdges(),), sensed(odometer(right)), graph)
     stated = replace(
         measured, steps=tuple(replace(s, information=s.information / 4) for s in measured.steps)
@@ -205,8 +206,7 @@ def test_odometry_better_than_stated_gets_more_weight():
 
 def test_odometry_errors_are_estimated_from_constrained_motion():
     """Frames along a wall: their motion along it is extrapolated."""
-    right = truth()
-    graph = tracked(right, 0 * NODDING)
+    right, graph = walked(0 * NODDING)
     wall = (np.arange(N) >= 10) & (np.arange(N) < 48)
     measurements = graph.measurements.copy()
     slide = wall[graph.edges[:, 1]]
@@ -247,8 +247,7 @@ def test_odometry_verifies_depth_unit(factor, motion, metric):
 
 def test_bent_pairs_that_agree_with_each_other_lose_to_odometry():
     """A refined graph claims far more than its common error allows; odometry drifts little."""
-    right = truth()
-    graph = tracked(right, 0 * NODDING)
+    right, graph = walked(0 * NODDING)
     measured = measure_all((OdometryEdges(),), sensed(odometer(right, 0.002)), graph)
     bent = tracked(right, np.array([0.002, 0, 0, 0, 0.004, 0]))
     pairs = replace(bent, information=100 * bent.information)
@@ -259,8 +258,7 @@ def test_bent_pairs_that_agree_with_each_other_lose_to_odometry():
 
 
 def test_jump_of_odometry_is_left_out():
-    right = truth()
-    graph = tracked(right, 0 * NODDING)
+    right, graph = walked(0 * NODDING)
     jumped = odometer(right)
     jumped[30:] = jumped[30:] @ np.eye(4)
     jumped[30:, :3, 3] += [0.5, 0, 0.2]

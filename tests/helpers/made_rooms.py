@@ -54,10 +54,12 @@ def seen(
     scene: int = 3,
     noise: float = 0.004,
     rate: float = 10.0,
+    camera: Pinhole = CAMERA,
+    shaded: bool = True,
 ) -> RangeFrame:
     """View of walls and boxes with spots of other albedo, whose places depend on `scene`."""
-    rows, columns = CAMERA.height, CAMERA.width
-    rays = np.dstack([CAMERA.rays(), np.ones((rows, columns))]).reshape(-1, 3)
+    rows, columns = camera.height, camera.width
+    rays = np.dstack([camera.rays(), np.ones((rows, columns))]).reshape(-1, 3)
     origin, d = T_world_camera[:3, 3], rays @ T_world_camera[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
         walls = (np.sign(d) * half - origin) / d
@@ -83,13 +85,13 @@ def seen(
         albedo[((p - spot) ** 2).sum(1) < size**2] = level
     rng = np.random.default_rng([4, index])
     z = z * (1 + noise * rng.standard_normal(len(z)))
-    cosine = np.abs(across) / np.linalg.norm(d, axis=1)
+    cosine = np.abs(across) / np.linalg.norm(d, axis=1) if shaded else 1.0
     light = 1000 * albedo * cosine * (1 + 0.02 * rng.standard_normal(len(z)))
     depth, light = (x.reshape(rows, columns).astype(np.float32) for x in (z, light))
     return RangeFrame(
         index,
         index / rate,
-        CAMERA,
+        camera,
         depth,
         "z",
         amplitude_image=light,

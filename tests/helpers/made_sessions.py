@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -59,11 +59,10 @@ def made_result(folder: Path, path: Sequence[Float64], number: int, **scene: obj
     return made_result_of(folder, [seen(T, 100 * number + k, **scene) for k, T in enumerate(path)])
 
 
-def made_result_of(folder: Path, frames: Sequence[RangeFrame]) -> Path:
-    """Record these frames beside `folder`, and write the result of a run into it."""
-    recording = folder.with_name(f"{folder.name}-recording")
+def recorded(folder: Path, frames: Iterable[RangeFrame]) -> Path:
+    """Record these frames, ten per second."""
     writer = RecordingWriter(
-        recording,
+        folder,
         CAMERA,
         depth_unit_m=0.0005,
         depth_kind="z",
@@ -73,6 +72,12 @@ def made_result_of(folder: Path, frames: Sequence[RangeFrame]) -> Path:
     for k, frame in enumerate(frames):
         writer.add(replace(frame, index=k, timestamp=k / 10))
     writer.finish()
+    return folder
+
+
+def made_result_of(folder: Path, frames: Sequence[RangeFrame]) -> Path:
+    """Record these frames beside `folder`, and write the result of a run into it."""
+    recording = recorded(folder.with_name(f"{folder.name}-recording"), frames)
     opening = Opening((recording,))
     result = reconstruct(opening.open(), quick(), threads=2)
     about = {**result.recording, "opening": opening.to_dict()}

@@ -73,13 +73,15 @@ class Bag:
         first = (7,) if self.kind == "ros1" else ()
         return self.make("std_msgs/msg/Header", *first, stamp, frame)
 
-    def tf(self, topic: str, time: float, parent: str, child: str, T: np.ndarray) -> None:
+    def motion(self, T: np.ndarray) -> Any:
         q = quaternion.from_matrix(T[:3, :3])
         vector = self.make("geometry_msgs/msg/Vector3", *map(float, T[:3, 3]))
         turn = self.make("geometry_msgs/msg/Quaternion", *map(float, q))
-        motion = self.make("geometry_msgs/msg/Transform", vector, turn)
+        return self.make("geometry_msgs/msg/Transform", vector, turn)
+
+    def tf(self, topic: str, time: float, parent: str, child: str, T: np.ndarray) -> None:
         kind = "geometry_msgs/msg/TransformStamped"
-        stamped = self.make(kind, self.header(time, parent), child, motion)
+        stamped = self.make(kind, self.header(time, parent), child, self.motion(T))
         name = "tf2_msgs/msg/TFMessage"
         self.write(topic, name, time, self.make(name, [stamped]))
 
@@ -122,11 +124,7 @@ class Bag:
         self.write(topic, ros.COMPRESSED, time, message)
 
     def transform(self, topic: str, T: np.ndarray) -> None:
-        q = quaternion.from_matrix(T[:3, :3])
-        vector = self.make("geometry_msgs/msg/Vector3", *map(float, T[:3, 3]))
-        turn = self.make("geometry_msgs/msg/Quaternion", *map(float, q))
-        kind = "geometry_msgs/msg/Transform"
-        self.write(topic, kind, 1.0, self.make(kind, vector, turn))
+        self.write(topic, "geometry_msgs/msg/Transform", 1.0, self.motion(T))
 
     def info(
         self,

@@ -12,8 +12,8 @@ import pytest
 
 import tofuse
 from cli_calls import call, listing, refuses
-from made_rooms import CAMERA, OTHER, at, seen
-from made_sessions import HERE
+from made_rooms import OTHER, at, seen
+from made_sessions import HERE, recorded
 from tofuse.apps.jobs import locating
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
@@ -23,7 +23,6 @@ from tofuse.engine.mapping import clips
 from tofuse.engine.progress import Silent
 from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.poses.trajectory import read_tum
-from tofuse.formats.recordings.native import RecordingWriter
 
 # A second pass, beside and above the first one.
 AGAIN = [at(0.1 + 0.02 * k, 0.1, 0.05 + 0.1 * k, 0.25, -0.05) for k in range(6)]
@@ -35,19 +34,8 @@ FOREIGN = (
 )
 
 
-def recorded(folder: Path, poses, **scene) -> Path:
-    writer = RecordingWriter(
-        folder,
-        CAMERA,
-        depth_unit_m=0.0005,
-        depth_kind="z",
-        frame_rate_hz=10.0,
-        amplitude_kind="range_compensated",
-    )
-    for k, T in enumerate(poses):
-        writer.add(replace(seen(T, 900 + k, **scene), index=k, timestamp=k / 10))
-    writer.finish()
-    return folder
+def again(folder: Path, poses=AGAIN, **scene) -> Path:
+    return recorded(folder, (seen(T, 900 + k, **scene) for k, T in enumerate(poses)))
 
 
 def error_m(T_world_camera, T_room_camera) -> float:
@@ -62,7 +50,7 @@ def here(session_results) -> tofuse.Result:
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory) -> Path:
-    return recorded(tmp_path_factory.mktemp("clip") / "clip", AGAIN)
+    return again(tmp_path_factory.mktemp("clip") / "clip")
 
 
 def locate_json(capfd, *words: object) -> tuple[int, dict]:
@@ -172,7 +160,7 @@ def test_one_frame_of_a_recording(session_results, clip, capsys) -> None:
 
 
 def test_clip_of_another_room_has_status_3(session_results, tmp_path, capfd) -> None:
-    foreign = recorded(tmp_path / "foreign", AGAIN[::2], **FOREIGN[1])
+    foreign = again(tmp_path / "foreign", AGAIN[::2], **FOREIGN[1])
     out = tmp_path / "out"
     status, data = locate_json(capfd, session_results["here"], foreign, "--out", out)
     assert status == 3

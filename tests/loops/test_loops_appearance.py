@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from made_rooms import at, seen
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.thread_pool import threads
-from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops.appearance import Appearance
 from tofuse.engine.loops.revisits import Revisits
@@ -31,41 +31,10 @@ BOXES = [
 ]
 
 
-def room(yaw, index, *, half=(2.5, 1.2, 2.0), boxes=BOXES, spots=60, noise=0.004):
+def room(yaw, index, *, half=(2.5, 1.2, 2.0), boxes=BOXES, spots=60):
     """Image of a camera in the middle of a room, rotated by `yaw`."""
-    rays = np.dstack([CAMERA.rays(), np.ones((72, 96))]).reshape(-1, 3)
-    d = rays @ se3.so3_exp([0, yaw, 0]).T
-    z = (np.array(half) / np.abs(d)).min(1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for centre, size, turn in boxes:
-            R = se3.so3_exp([0, turn, 0])
-            o, e = (-np.array(centre)) @ R, d @ R
-            a, b = (-np.array(size) - o) / e, (np.array(size) - o) / e
-            near, far = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
-            z = np.where((near < far) & (near > 0) & (near < z), near, z)
-    p = z[:, None] * d
-    rng = np.random.default_rng(3)
-    albedo = np.ones(len(p))
-    for at, size, level in zip(
-        rng.uniform(-1, 1, (spots, 3)) * half,
-        rng.uniform(0.1, 0.35, spots),
-        rng.uniform(0.4, 1.6, spots),
-        strict=True,
-    ):
-        albedo[((p - at) ** 2).sum(1) < size**2] = level
-    rng = np.random.default_rng([4, index])
-    z = z * (1 + noise * rng.standard_normal(len(z)))
-    light = 1000 * albedo * (1 + 0.02 * rng.standard_normal(len(z)))
-    depth, light = (x.reshape(72, 96).astype(np.float32) for x in (z, light))
-    return RangeFrame(
-        index,
-        index / 10,
-        CAMERA,
-        depth,
-        "z",
-        amplitude_image=light,
-        amplitude_kind="range_compensated",
-    )
+    T = at(0, 0, yaw, pitch=0)
+    return seen(T, index, half=half, boxes=boxes, spots=spots, camera=CAMERA, shaded=False)
 
 
 def turning(count, step, **options):

@@ -61,15 +61,16 @@ def chain(posed, truth, inflation, wrong):
     return BackEnd(job, log, poses, ())
 
 
+def closed(truth) -> ClosedLoop:
+    record = LoopRecord(0, len(truth) - 1, True, "made")
+    return ClosedLoop(record, se3.inverse(truth[0]) @ truth[-1], np.diag(SIGMA**-2))
+
+
 def test_loop_gap_does_not_separate_consistent_images(posed_views) -> None:
     posed, truth = posed_views
     n = len(truth)
     wrong, unusual = 2, n - 2
-    loop = ClosedLoop(
-        LoopRecord(0, n - 1, True, "made"),
-        se3.inverse(truth[0]) @ truth[-1],
-        np.diag(SIGMA**-2),
-    )
+    loop = closed(truth)
     end = chain(posed, truth, {unusual: 100.0}, wrong)
 
     def moved(graph, k):
@@ -87,12 +88,8 @@ def test_loop_gap_does_not_separate_consistent_images(posed_views) -> None:
 
 def test_registration_contradicted_by_images_stays_uncertain(posed_views) -> None:
     posed, truth = posed_views
-    n, wrong = len(truth), 3
-    loop = ClosedLoop(
-        LoopRecord(0, n - 1, True, "made"),
-        se3.inverse(truth[0]) @ truth[-1],
-        np.diag(SIGMA**-2),
-    )
+    wrong = 3
+    loop = closed(truth)
     end = chain(posed, truth, {wrong: 100.0}, wrong)
     optimisation, confirmed = end._optimise(end._tracked.build([loop]), [loop], SensorPriors())
     assert not confirmed

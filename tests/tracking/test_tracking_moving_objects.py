@@ -124,15 +124,20 @@ def test_static_room_has_no_moving_objects(room):
         assert 0.5 < moving.scale / typical_scale < 2
 
 
-@pytest.mark.parametrize(("motion", "cover"), [("sideways", 0.1), ("towards", 0.25), ("away", 0.4)])
-def test_moving_box_is_segmented(room, motion, cover):
+def segmented(room, motion, cover):
+    """The images of a moving box with its masks, their views, and what is found in these."""
     frames, poses, noise = room
     centres, half = trajectory(motion, cover, frames[0])
     made = [
         with_box(frame, centre, half, noise, n)
         for n, (frame, centre) in enumerate(zip(frames, centres, strict=True))
     ]
-    views, found = segment([frame for frame, _ in made], poses)
+    return made, *segment([frame for frame, _ in made], poses)
+
+
+@pytest.mark.parametrize(("motion", "cover"), [("sideways", 0.1), ("towards", 0.25), ("away", 0.4)])
+def test_moving_box_is_segmented(room, motion, cover):
+    made, views, found = segmented(room, motion, cover)
     late = range(FRAMES - 5, FRAMES)
     truth, right, wrong, valid, vacated, predicted = np.zeros(6)
     for n in late:
@@ -155,13 +160,7 @@ def test_moving_box_is_segmented(room, motion, cover):
 
 
 def test_entering_object_is_segmented_and_forgotten_after_leaving(room):
-    frames, poses, noise = room
-    centres, half = trajectory("through", 0.1, frames[0])
-    made = [
-        with_box(frame, centre, half, noise, n)
-        for n, (frame, centre) in enumerate(zip(frames, centres, strict=True))
-    ]
-    views, found = segment([frame for frame, _ in made], poses)
+    made, views, found = segmented(room, "through", 0.1)
     seen = [n for n in range(1, FRAMES) if made[n][1].mean() > 0.03]
     assert seen[0] > 3  # it is not there at first
     for n in range(1, seen[0] - 1):
