@@ -423,17 +423,20 @@ def _sample_of(recording: Recording, poses: Float64) -> Recording:
     spaced = clips.spaced_frames(
         recording, dict(zip(indices.tolist(), poses[posed], strict=True)), _SPACING
     )
-    moments = [
-        FrameTime(int(index), float(time))
-        for index, time in zip(indices, recording.timestamps[posed], strict=True)
-    ]
-    jumps = [k for k, _ in find_jumps(list(poses[posed]), moments)][:_MAX_JUMPS]
+    jumps = np.searchsorted(posed, [*_jumps(recording, poses)][:_MAX_JUMPS])
     at_jumps = [indices[k] for jump in jumps for k in (jump - 1, jump)]
     enough = len(spaced) >= _MIN_SAMPLE
     chosen = [*spaced, indices[-1]] if enough else evenly_spaced(indices, _MIN_SAMPLE).tolist()
     chosen = np.unique(np.array([*chosen, *at_jumps], np.intp))
     source: Any = _Keeping(recording.source)
     return replace(recording, source=source, indices=chosen)
+
+
+def _jumps(recording: Recording, poses: Float64) -> dict[int, str]:
+    """Return the rows of poses (N, 4, 4) at which they jump, and what the jump is like."""
+    times = zip(recording.indices.tolist(), recording.timestamps.tolist(), strict=True)
+    known = [T if np.isfinite(T).all() else None for T in poses]
+    return dict(find_jumps(known, [FrameTime(*of_frame) for of_frame in times]))
 
 
 def _propagated(poses: Float64, rows: Intp, refined: Float64) -> Float64:
@@ -743,14 +746,8 @@ def _reasons(
         if not contradictions or r.code != "uncertain_poses"
     )
     # The camera itself may have moved abruptly; then the refined poses jump as well.
-    moments = [
-        FrameTime(index, time)
-        for index, time in zip(indices, recording.timestamps.tolist(), strict=True)
-    ]
-    actual_jumps = {k for k, _ in find_jumps(_or_none(refined), moments)}
-    jumped = {
-        k: words for k, words in find_jumps(_or_none(poses), moments) if k not in actual_jumps
-    }
+    actual = _jumps(recording, refined)
+    jumped = {k: words for k, words in _jumps(recording, poses).items() if k not in actual}
     if jumped:
         first = next(iter(jumped))
         ranges = frame_ranges.runs_of(indices, [indices[k] for k in jumped])
@@ -784,10 +781,6 @@ def _contradiction(
     if cause is not None:
         text += f" The cause is probably {cause.text}."
     yield Reason("inconsistent_poses", steps or full_range, text)
-
-
-def _or_none(poses: Float64) -> list[Float64 | None]:
-    return [T if np.isfinite(T).all() else None for T in poses]
 
 
 def _consistencies(

@@ -288,17 +288,14 @@ def merge_files(
         result = merge_sessions(
             sessions, config, seed=options.seed, threads=options.threads, progress=progress
         )
-        texture = None
-        if config.fusion.texture:
-            recording, _ = joined_recording(sessions)
-            texture = texturing.make_texture(
-                recording,
-                result,
-                config.fusion.texture,
-                options.threads,
-                progress,
-                required=bool(options.texture),
-            )
+        texture = texturing.make_texture(
+            joined_recording(sessions)[0],
+            result,
+            config.fusion.texture,
+            options.threads,
+            progress,
+            required=bool(options.texture),
+        )
         progress.stage("writing")
         with threadpool_limits(1):
             write_result(result, folder, partial(_report, texture, result), texture)

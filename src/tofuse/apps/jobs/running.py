@@ -168,10 +168,7 @@ def _texture(
     job: _Job, result: Reconstruction, options: Options, progress: Progress
 ) -> texture.Textured | None:
     """Make the texture unless none is wanted; with a note if one is required and impossible."""
-    size = job.config.fusion.texture
-    if not size:
-        return None
-    required = bool(options.texture)
+    size, required = job.config.fusion.texture, bool(options.texture)
     texture = texturing.make_texture(
         job.recording, result, size, options.threads, progress, required=required
     )

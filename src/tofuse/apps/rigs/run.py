@@ -89,12 +89,14 @@ def run_rig(
             result = reconstruct_rig(
                 cameras, recording, config, seed=options.seed or 0, progress=progress
             )
-            texture = None
-            if size := config.fusion.texture:
-                required = bool(options.texture)
-                texture = texturing.make_texture(
-                    recording, result.result, size, options.threads, progress, required=required
-                )
+            texture = texturing.make_texture(
+                recording,
+                result.result,
+                config.fusion.texture,
+                options.threads,
+                progress,
+                required=bool(options.texture),
+            )
             progress.stage("writing")
             _write(result, recording, folder, texture, share=options.share)
     return result

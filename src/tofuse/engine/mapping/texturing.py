@@ -39,7 +39,7 @@ def make_texture(
     *,
     required: bool = False,
 ) -> texture.Textured | None:
-    """Make the texture of a model's surface; None without a surface or without colour.
+    """Make the texture of a model's surface; None without a size, a surface, or colour.
 
     Unless a texture is required, also None if the images show too little of the surface, or are
     too small, to look better than the colours of the vertices.
@@ -58,7 +58,7 @@ def make_texture(
         Whether to make one of any images, and of amplitudes where there is no colour.
     """
     mesh = result.mesh
-    if mesh is None or not len(mesh.faces):
+    if not size or mesh is None or not len(mesh.faces):
         return None
     colored = steadiest_frames(result, _colored(recording))
     probed = evenly_spaced(np.array(colored, np.intp), _PROBED)
