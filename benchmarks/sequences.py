@@ -18,7 +18,6 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.base import Filter, apply_filters
-from tofuse.engine.filters.thresholds import Foreground
 from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.adaptation import with_recording_defaults
@@ -26,6 +25,7 @@ from tofuse.engine.mapping.methods import default
 from tofuse.engine.quality.map_agreement import poses_of_frames
 from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.open import open_recording
+from tofuse.lab.methods.filters_foreground import Foreground
 from tofuse.lab.simulation.record import simulate
 
 HERE = Path(__file__).resolve().parent

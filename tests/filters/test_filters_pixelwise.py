@@ -1,4 +1,4 @@
-"""Filters of single points: confidence, distance, foreground."""
+"""Filters of single points: confidence, distance."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.filters.base import Removal, apply_filters
-from tofuse.engine.filters.thresholds import Confidence, Distance, Foreground, otsu
+from tofuse.engine.filters.thresholds import Confidence, Distance
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 
 
@@ -47,46 +47,6 @@ def test_distance_distinguishes_z_and_range() -> None:
 def test_cloud_distance_is_from_origin() -> None:
     cloud = CloudFrame(0, 0.0, np.float32([[0, 0, -5], [10, 0, 0]]), origin=np.array([9.0, 0, 0]))
     assert Distance(0.0, 2.0).mask(cloud, ()).tolist() == [False, True]
-
-
-def test_foreground_is_separated_at_gap() -> None:
-    rng = np.random.default_rng(0)
-    z = np.full((40, 40), 3.0) + 0.05 * rng.standard_normal((40, 40))
-    z[10:30, 12:24] = 1.0 + 0.05 * rng.standard_normal((20, 12))
-    z[0, :5] = 0
-    keep = Foreground().mask(frame(z), ())
-    expected = np.zeros((40, 40), bool)
-    expected[10:30, 12:24] = True
-    assert np.array_equal(keep & (z > 0), expected)
-
-
-def test_foreground_keeps_unimodal_depths() -> None:
-    rng = np.random.default_rng(1)
-    even = frame(rng.uniform(1, 2, (60, 60)))
-    bell = frame(2 + 0.1 * rng.standard_normal((60, 60)))
-    flat = frame(np.full((4, 4), 2.0))
-    for f in (even, bell, flat, frame(np.zeros((4, 4)))):
-        assert Foreground().mask(f, ()).all()
-    assert not Foreground(separability=0.0).mask(even, ()).all()
-    assert Foreground(limit=1.5).mask(frame([[1.5, 1.6], [1, 9]]), ()).tolist() == [
-        [True, False],
-        [True, False],
-    ]
-
-
-def test_otsu_maximises_between_class_variance() -> None:
-    rng = np.random.default_rng(2)
-    values = np.concatenate([rng.normal(1, 0.1, 300), rng.normal(2, 0.2, 900)]).astype(np.float32)
-    limit, eta = otsu(values)
-
-    def between(t: float) -> float:
-        low, high = values[values <= t], values[values > t]
-        return len(low) * len(high) / len(values) ** 2 * float(low.mean() - high.mean()) ** 2
-
-    best = max(between(t) for t in np.sort(values)[:-1])
-    assert between(limit) == pytest.approx(best, rel=1e-3)
-    assert eta == pytest.approx(best / float(values.var()), rel=1e-2)
-    assert otsu(np.zeros(0, np.float32)) == (np.inf, 0.0)
 
 
 def test_filters_are_applied_in_sequence() -> None:

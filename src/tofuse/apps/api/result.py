@@ -37,7 +37,6 @@ from tofuse.apps.results import (
     write_result,
 )
 from tofuse.engine.errors import InputError
-from tofuse.engine.filters import Foreground
 from tofuse.engine.frames import Frame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
@@ -364,10 +363,11 @@ def reconstruct(
     with _with_terminal(progress) as display:
         chosen = _configuration(config, recording)
         # No sensor measures the motion relative to a moving object.
-        if not {name_of(part) for part in chosen.filters} & {"background", "foreground"}:
+        filters = {name_of(part) for part in chosen.filters}
+        if not filters & {"background", "foreground"}:
             recording, chosen = adaptation.with_prior(recording, chosen, prior)
         fitted = adaptation.adapted(chosen, recording, threads, display)
-        turning = any(isinstance(part, Foreground) for part in fitted.filters)
+        turning = "foreground" in filters
         findings = quick_findings(recording, fitted, turning=turning)
         reconstruction = reconstructing.reconstruct(
             recording, fitted, seed=seed, threads=threads, loops=loops, progress=display

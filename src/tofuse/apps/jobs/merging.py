@@ -200,16 +200,10 @@ def _with_sessions(
         )
         for k, (session, offset) in enumerate(zip(sessions, offsets, strict=True))
     )
-    facts = {
-        "path": recording.path,
-        "format": recording.format,
-        "frames": len(recording),
-        "warnings": list(recording.warnings),
-    }
     components_before = [{s.component for s in session.posed.values()} for session in sessions]
     pairs = session_pairs(result, records, components_before, views)
     result = replace(
-        reconstructing.with_recording_facts(result, facts),
+        reconstructing.with_recording_facts(result, reconstructing.recording_facts(recording)),
         sessions=records,
         session_pairs=pairs,
         changes=session_changes(result, records, views),

@@ -22,6 +22,6 @@ if TYPE_CHECKING:
         NeighbourhoodAngle,
         mean_neighbour_distance,
     )
-    from tofuse.engine.filters.thresholds import Confidence, Foreground
+    from tofuse.engine.filters.thresholds import Confidence
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -11,6 +11,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.color_frames import Unread
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.preparation import Preparation
 from tofuse.engine.mapping.reconstructing import past_frames
@@ -22,14 +23,6 @@ from tofuse.engine.views import PreparedView, prepare_view
 # Views of a map, of which a place needs few, and width of their images.
 _SPACING = Spacing(0.12, 0.06, max_views=4000, max_stretch=1.0, views_per_place=1)
 _COLUMNS = 200
-
-
-@dataclass(frozen=True)
-class _Unread:
-    """A frame that is not read yet: enough to select it by its pose."""
-
-    index: int
-    depth: float
 
 
 def map_views(
@@ -53,9 +46,9 @@ def spaced_frames(
     """Return the frames that are spaced by motion, by poses (4, 4) of frames by index."""
     first = recording.first_readable()
     depth = 1.0 if first is None else first.mean_depth
-    selected: ViewStore[_Unread] = ViewStore(spacing)
+    selected: ViewStore[Unread] = ViewStore(spacing)
     for index, T in sorted(poses.items()):
-        selected.push(_Unread(index, depth), T)
+        selected.push(Unread(index, depth), T)
     return [unread.index for unread in selected.views]
 
 

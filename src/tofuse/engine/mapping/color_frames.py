@@ -23,8 +23,16 @@ _USUAL_RATE_HZ = 30.0
 
 
 @dataclass(frozen=True)
-class _Frame:
-    """A frame that may be selected: its index, and its typical range in m."""
+class Unread:
+    """A frame that is not read yet: enough to select it by its pose.
+
+    Attributes
+    ----------
+    index
+        Of the frame in its recording.
+    depth
+        Its typical range, m.
+    """
 
     index: int
     depth: float
@@ -50,10 +58,10 @@ class ColorFrames:
 
         `depths` are the typical radial ranges of frames with colour, by their index, m.
         """
-        store: ViewStore[_Frame] = ViewStore(_SPACING)
+        store: ViewStore[Unread] = ViewStore(_SPACING)
         for index, pose in zip(graph.ids.tolist(), graph.poses, strict=True):
             if depths.get(index, 0.0) > 0:
-                store.push(_Frame(index, depths[index]), pose)
+                store.push(Unread(index, depths[index]), pose)
         speeds = self._speeds(graph)
         chosen = np.array([item.index for item in store.views], np.intp)
         frames = replace(self.recording, indices=chosen)
