@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.apps.card.job import CardOptions, card_files
+    from tofuse.apps.card.job import card_files
     from tofuse.apps.card.making import Card, make_card
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from tofuse.apps.card.making import Card, make_card
@@ -14,15 +13,7 @@ CARD, PAGE = "card.json", "card.html"
 _CONTRACT = folders.Contract.of_files(CARD, PAGE, keys=("camera", "quantities"))
 
 
-@dataclass(frozen=True)
-class CardOptions:
-    """The options of ``tofuse card``; see its ``--help``."""
-
-    out: Path | None = None
-    overwrite: bool = False
-
-
-def card_files(results: Sequence[Path], options: CardOptions) -> Card:
+def card_files(results: Sequence[Path], options: folders.OutputOptions) -> Card:
     """Make a card, and write it if there is a folder for it; see `make_card` for errors.
 
     Raises
@@ -30,9 +21,7 @@ def card_files(results: Sequence[Path], options: CardOptions) -> Card:
     OutputError
         If it can't be written; existing files are then unchanged.
     """
-    with folders.output_folder(
-        options.out, overwrite=options.overwrite, contract=_CONTRACT
-    ) as folder:
+    with options.folder(_CONTRACT) as folder:
         card = make_card(results)
         if folder is not None:
             with folder.staging() as staging:

@@ -83,9 +83,10 @@ def repeat(arguments: cli.Repeat) -> int:
 
 def card(arguments: cli.Card) -> int:
     """``tofuse card``."""
-    from tofuse.apps.card import CardOptions, card_files
+    from tofuse.apps.card import card_files
+    from tofuse.apps.results import folders
 
-    options = from_arguments(CardOptions, arguments)
+    options = from_arguments(folders.OutputOptions, arguments)
     found = card_files(arguments.results, options)
     table = Table("quantity", "mean", "scatter", "over the time", "p", "", box=None)
     for row in found.rows:

@@ -37,24 +37,20 @@ _STATUS = {None: 0, "pass": 0, "fail": 3, "undecided": 4}
 
 
 @dataclass(frozen=True)
-class CompareOptions:
+class CompareOptions(folders.OutputOptions):
     """The options of ``tofuse compare``; see its ``--help``."""
 
     tolerance: float | None = None
     guess: Path | None = None
     accuracy: float | None = None
     unit: Literal["mm", "cm", "m"] | None = None
-    out: Path | None = None
-    overwrite: bool = False
     threads: int | None = None
 
 
 @dataclass(frozen=True)
-class RepeatOptions:
+class RepeatOptions(folders.OutputOptions):
     """The options of ``tofuse repeat``; see its ``--help``."""
 
-    out: Path | None = None
-    overwrite: bool = False
     threads: int | None = None
 
 
@@ -145,9 +141,7 @@ def _done(
     with (
         threads(options.threads),
         threadpool_limits(1),
-        folders.output_folder(
-            options.out, overwrite=options.overwrite, contract=contract
-        ) as folder,
+        options.folder(contract) as folder,
     ):
         found = work()
         if folder is not None:

@@ -476,11 +476,9 @@ def _support(compared: cross_view_agreement.CrossViewConsistency) -> float:
 
 
 @dataclass(frozen=True)
-class JudgeOptions(OpeningOptions):
+class JudgeOptions(OpeningOptions, folders.OutputOptions):
     """The options of ``tofuse judge``; see its ``--help``."""
 
-    out: Path | None = None
-    overwrite: bool = False
     tolerance: float | None = None
     scale: bool = False
     threads: int | None = None
@@ -503,7 +501,7 @@ def judge_files(
     """
     opening = Opening.of(inputs, options)
     recording = opening.open()
-    with folders.output_folder(options.out, overwrite=options.overwrite) as folder:
+    with options.folder() as folder:
         judgement = judge(
             recording,
             trajectory,

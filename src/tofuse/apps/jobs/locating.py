@@ -240,11 +240,9 @@ def _located(
 
 
 @dataclass(frozen=True)
-class LocateOptions(OpeningOptions):
+class LocateOptions(OpeningOptions, folders.OutputOptions):
     """The options of ``tofuse locate``; see its ``--help``."""
 
-    out: Path | None = None
-    overwrite: bool = False
     threads: int | None = None
 
 
@@ -262,9 +260,7 @@ def locate_files(
     """
     with threads(options.threads), threadpool_limits(1):
         progress.stage("opening")
-        with folders.output_folder(
-            options.out, overwrite=options.overwrite, contract=_CONTRACT
-        ) as folder:
+        with options.folder(_CONTRACT) as folder:
             located = _located_in(result, name, options, progress)
             if folder is not None:
                 progress.stage("writing")

@@ -31,7 +31,7 @@ from tofuse.formats.recordings import SingleView
 
 
 @dataclass(frozen=True)
-class PairOptions:
+class PairOptions(folders.OutputOptions):
     """Options of the registration of two views.
 
     Attributes
@@ -44,10 +44,6 @@ class PairOptions:
         Whether the source is of unknown scale.
     risk
         Largest probability, up to `MAX_RISK`, with which an accepted pose may be wrong.
-    out
-        Folder for the result; None writes none.
-    overwrite
-        Whether an earlier registration there is replaced.
     format, camera, topic
         As in `open_recording`. The camera is that of all inputs that store images.
     threads
@@ -58,8 +54,6 @@ class PairOptions:
     method: str | None = None
     scale: bool = False
     risk: float = MAX_RISK
-    out: Path | None = None
-    overwrite: bool = False
     format: str | None = None
     camera: Path | None = None
     topic: str | None = None
@@ -85,9 +79,7 @@ def register_files(
     with threads(options.threads), threadpool_limits(1):
         progress.stage("opening")
         guess = None if options.guess is None else read_pose(options.guess)
-        with folders.output_folder(
-            options.out, overwrite=options.overwrite, contract=CONTRACT
-        ) as folder:
+        with options.folder(CONTRACT) as folder:
             result = _registered(source, target, guess, options, progress)
             if folder is not None:
                 progress.stage("writing")

@@ -156,16 +156,28 @@ class OutputFolder(staging.StagedFolder):
             )
 
 
-def output_folder(
-    path: Path | None, *, overwrite: bool, contract: Contract | None = None
-) -> AbstractContextManager[OutputFolder | None]:
-    """Return the folder for the result of a command; None in a context if it is not to be written.
+@dataclass(frozen=True)
+class OutputOptions:
+    """Options of a command that writes its result if there is a folder for it.
 
-    See `OutputFolder` for the arguments and the errors.
+    Attributes
+    ----------
+    out
+        Folder for the result; None writes none.
+    overwrite
+        Whether an earlier result there is replaced.
     """
-    if path is None:
-        return nullcontext()
-    return OutputFolder(path, overwrite=overwrite, contract=contract)
+
+    out: Path | None = None
+    overwrite: bool = False
+
+    def folder(
+        self, contract: Contract | None = None
+    ) -> AbstractContextManager[OutputFolder | None]:
+        """Return the folder, None in a context if there is none; see `OutputFolder` for errors."""
+        if self.out is None:
+            return nullcontext()
+        return OutputFolder(self.out, overwrite=self.overwrite, contract=contract)
 
 
 def check_output(path: Path, *, overwrite: bool) -> None:
