@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import pose_errors
 from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align
 from tofuse.engine.geometry import se3
 from tofuse.engine.views.prepared_view import prepare_view
@@ -50,15 +51,8 @@ def wall():
     return Pair("wall", 0, 3, noise=True)
 
 
-def error(found, true):
-    off = se3.inverse(true) @ found.T_world_source
-    return float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
-
-
 def assert_near(found, true, metres=0.001, degrees=0.02):
-    off = error(found, true)
-    assert off[0] < metres, off
-    assert off[1] < degrees, off
+    pose_errors.assert_near(found.T_world_source, true, metres, degrees)
 
 
 @pytest.mark.parametrize("options", [OPTIONS, GEOMETRY], ids=["albedo", "geometry"])
@@ -161,7 +155,7 @@ def test_small_scene_is_equally_robust(room):
         aligned = align(views[1], [Target(views[0], np.eye(4))], np.eye(4), coarse)
         T = aligned.T_world_source.copy()
         T[:3, 3] /= size
-        found.append(error(replace(aligned, T_world_source=T), room.poses[1])[0])
+        found.append(pose_errors.pose_error(T, room.poses[1])[0])
     assert found[0] < 0.003
     assert found[1] < 0.003
 

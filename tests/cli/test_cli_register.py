@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from cli_calls import call, listing, refuses
+from pose_errors import pose_error
 from registration_scenes import bumpy_ball, stone, turn
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.clouds import AnyPair
@@ -53,14 +54,8 @@ def register_json(capfd, *words: object) -> tuple[int, dict]:
     return status, json.loads(out)
 
 
-def gap(T: np.ndarray, truth: np.ndarray, at: np.ndarray) -> tuple[float, float]:
-    """Distance between a point moved by two motions (m), and their angle (degrees)."""
-    step = se3.transform(T, at[None]) - se3.transform(truth, at[None])
-    return float(np.linalg.norm(step)), float(np.degrees(se3.angle(se3.inverse(T) @ truth)))
-
-
 def near(T: object, truth: np.ndarray, at=(0, 0, 2.0), metres=0.01, degrees=0.5) -> None:
-    moved, turned = gap(np.asarray(T), truth, np.asarray(at, float))
+    moved, turned = pose_error(np.asarray(T), truth, np.array([at]))
     assert moved < metres
     assert turned < degrees
 

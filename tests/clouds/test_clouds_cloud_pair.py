@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import tofuse
+from pose_errors import pose_error
 from registration_scenes import box_walls, bumpy_ball, turn
 from scanned_flat import scanned
 from tofuse.engine.alignment.base import Registration
@@ -83,13 +84,6 @@ def clips():
         fused.append((T_first, thin.points.astype(float)))
     (T_a, a), (T_b, b) = fused
     return b, a, se3.inverse(T_a) @ T_b
-
-
-def off(T, true, points):
-    """Error in m at the median of the source, and in degrees."""
-    middle = np.median(points, 0)[None].astype(float)
-    gap = se3.transform(T, middle) - se3.transform(true, middle)
-    return np.linalg.norm(gap), np.degrees(se3.angle(se3.inverse(true) @ T))
 
 
 # Viewpoints
@@ -323,8 +317,8 @@ def registered(scans):
 
 def test_scans_with_any_heading(scans, registered):
     (source, _, true), found = scans, registered
-    assert off(found.T_target_source, true, source)[0] < 0.02
-    assert off(found.T_target_source, true, source)[1] < 0.5
+    assert pose_error(found.T_target_source, true, source)[0] < 0.02
+    assert pose_error(found.T_target_source, true, source)[1] < 0.5
     assert found.believed
     assert found.probability > 0.9
     assert found.contradiction < 0.01
@@ -335,7 +329,7 @@ def test_clouds_without_viewpoint_under_any_rotation(frames):
     target, source, true = frames
     moved = se3.transform(ANYWHERE, source.points.astype(float))
     found = tofuse.register(moved, target.points)
-    shift, angle = off(found.T_target_source, true @ se3.inverse(ANYWHERE), moved)
+    shift, angle = pose_error(found.T_target_source, true @ se3.inverse(ANYWHERE), moved)
     assert shift < 0.1
     assert angle < 4
 
@@ -346,8 +340,8 @@ def test_clouds_of_different_density(scans):
     few = source[np.random.default_rng(2).permutation(len(source))[: len(source) // 10]]
     for pair, T in (((few, target), true), ((target, few), se3.inverse(true))):
         found = tofuse.register(*pair)
-        assert off(found.T_target_source, T, pair[0])[0] < 0.05
-        assert off(found.T_target_source, T, pair[0])[1] < 1.5
+        assert pose_error(found.T_target_source, T, pair[0])[0] < 0.05
+        assert pose_error(found.T_target_source, T, pair[0])[1] < 1.5
 
 
 @pytest.mark.nightly_part
@@ -365,7 +359,7 @@ def test_views_without_overlap_are_rejected(scans):
 def test_large_clouds_are_registered_by_a_part_of_their_points(scans, registered, monkeypatch):
     monkeypatch.setattr(any_pair, "_MAX_POINTS", 10_000)
     found = tofuse.register(*scans[:2])
-    assert off(found.T_target_source, registered.T_target_source, scans[0])[0] < 0.01
+    assert pose_error(found.T_target_source, registered.T_target_source, scans[0])[0] < 0.01
 
 
 @pytest.mark.parametrize("moved", [False, True])
@@ -375,7 +369,7 @@ def test_fused_clips_that_overlap_little_are_registered(clips, moved):
     if moved:
         source, true = se3.transform(ANYWHERE, source), true @ se3.inverse(ANYWHERE)
     found = tofuse.register(source, target)
-    shift, angle = off(found.T_target_source, true, source)
+    shift, angle = pose_error(found.T_target_source, true, source)
     assert shift < 0.05
     assert angle < 2
 
@@ -433,7 +427,7 @@ def test_guess_resolves_symmetry():
     other = box_walls(8000, 1, 0.003, "xyz")
     guess = se3.exp([0.02, -0.01, 0.01, 0.01, 0.02, -0.01])
     found = tofuse.register(other, walls, guess=guess)
-    assert off(found.T_target_source, np.eye(4), other)[0] < 0.01
+    assert pose_error(found.T_target_source, np.eye(4), other)[0] < 0.01
 
 
 def surface(boxes, seed):
@@ -499,7 +493,7 @@ def test_degenerate_clouds_are_not_accepted():
 def test_image_is_registered_to_cloud(frames):
     target, source, true = frames
     found = tofuse.register(source, CloudFrame.of(target.points))
-    assert off(found.T_target_source, true, source.points)[0] < 0.05
+    assert pose_error(found.T_target_source, true, source.points)[0] < 0.05
     assert found.believed
 
 
@@ -531,11 +525,11 @@ def test_views_are_chained_and_rejected_views_start_components(scans):
     steps = [tracker.push(replace(CloudFrame.of(p), index=k)) for k, p in enumerate(views)]
     assert [s.status for s in steps] == ["tracked"] * 4
     assert [s.component for s in steps] == [0, 0, 1, 2]
-    assert off(steps[1].T_component_camera, true, source)[0] < 0.02
+    assert pose_error(steps[1].T_component_camera, true, source)[0] < 0.02
     assert not steps[1].doubtful
     # The first view of the last component is linked to the first component.
     assert [(link.i, link.j) for link in steps[3].links] == [(1, 3)]
-    assert off(steps[3].links[0].T_i_j, np.eye(4), source)[0] < 0.01
+    assert pose_error(steps[3].links[0].T_i_j, np.eye(4), source)[0] < 0.01
     lost = tracker.push(replace(CloudFrame.of(target[:5]), index=4))
     assert lost.status == "lost"
     assert "5 valid points" in lost.reason
@@ -556,8 +550,8 @@ def test_folder_of_scans_becomes_one_model(tmp_path):
     assert [f.status for f in result.diagnostics.frames] == ["tracked"] * 3
     for k, (T, points) in enumerate(taken):
         true = se3.inverse(taken[0][0]) @ T
-        assert off(result.trajectory[k], true, points)[0] < 0.02
-        assert off(result.trajectory[k], true, points)[1] < 0.3
+        assert pose_error(result.trajectory[k], true, points)[0] < 0.02
+        assert pose_error(result.trajectory[k], true, points)[1] < 0.3
 
 
 @pytest.mark.nightly

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import tofuse
+from pose_errors import pose_error
 from registration_scenes import rng, turn
 from searched_pair import TRUE, A, B, seen
 from tofuse.engine.clouds.fpfh import fpfh, mutually_nearest
@@ -19,13 +20,6 @@ def corners():
     return seen(B, seed=1).points.astype(float), seen(A, seed=2).points.astype(float)
 
 
-def off(found, true, points):
-    """Distance in m between the images of the median point, and angle in degrees."""
-    middle = np.median(points, 0)[None]
-    shift = se3.transform(found, middle) - se3.transform(true, middle)
-    return float(np.linalg.norm(shift)), float(np.degrees(se3.angle(se3.inverse(true) @ found)))
-
-
 def test_real_pair_of_lidar_scans_upside_down(shared_data):
     folder = shared_data / "lidar_pair_gt"
     source, target = (read_ply(folder / f"{name}.ply").points for name in ("source", "target"))
@@ -33,7 +27,7 @@ def test_real_pair_of_lidar_scans_upside_down(shared_data):
     turned = turn([1.0, 0.4, 0.2], 160, centre=np.median(source, 0))
     moved = se3.transform(se3.inverse(turned), source)
     found = tofuse.register(moved, target)  # nothing to set up
-    shift, angle = off(found.T_target_source, T @ turned, moved)
+    shift, angle = pose_error(found.T_target_source, T @ turned, moved)
     assert shift < 0.03
     assert angle < 0.5
 
@@ -44,14 +38,14 @@ def test_wrong_start_is_left_without_guess(corners):
     turned = turn([0.2, 1, 0.3], 150, centre=np.median(source, 0) + 5)
     moved = se3.transform(se3.inverse(turned), source)
     found = tofuse.register(moved, target)
-    assert off(found.T_target_source, TRUE @ turned, moved)[0] < 0.01
+    assert pose_error(found.T_target_source, TRUE @ turned, moved)[0] < 0.01
     # A wrong guess is left as well; a start that leads to the pose is kept.
     far = tofuse.register(moved, target, guess=np.eye(4))
-    assert off(far.T_target_source, TRUE @ turned, moved)[0] < 0.01
+    assert pose_error(far.T_target_source, TRUE @ turned, moved)[0] < 0.01
     near = tofuse.register(source, target, guess=TRUE)
-    assert off(near.T_target_source, TRUE, source)[0] < 0.01
+    assert pose_error(near.T_target_source, TRUE, source)[0] < 0.01
     again = tofuse.register(se3.transform(TRUE, source), target)
-    assert off(again.T_target_source, np.eye(4), source)[0] < 0.01
+    assert pose_error(again.T_target_source, np.eye(4), source)[0] < 0.01
 
 
 # The parts

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pose_errors import pose_error
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.geometry import se3
@@ -38,10 +39,8 @@ def turn(axis, degrees, centre=MIDDLE):
 
 def error(found, T):
     """Translation, m, at the middle of the scene, and rotation, degrees."""
-    gap = se3.inverse(T) @ found.T_target_source
     at = se3.transform(se3.inverse(T), MIDDLE[None])
-    shift = np.linalg.norm(se3.transform(gap, at) - at)
-    return float(shift), float(np.rad2deg(se3.angle(gap)))
+    return pose_error(found.T_target_source, T, at)
 
 
 def directions(n, seed):

@@ -48,11 +48,6 @@ def camera(x, z, yaw, pitch=-0.35):
     return se3.pose(se3.so3_exp([0, yaw, 0]) @ se3.so3_exp([pitch, 0, 0]), [x, 0.0, z])
 
 
-def error(found, true):
-    off = se3.inverse(true) @ found
-    return float(np.linalg.norm(off[:3, 3])), float(np.degrees(se3.angle(off)))
-
-
 # Moved sideways, and rotated by 30 degrees about the scene.
 A, B = camera(-0.2, 0.0, 0.0), camera(0.55, 0.2, -0.5)
 

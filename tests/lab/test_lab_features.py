@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import tofuse
+from pose_errors import pose_error
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.clouds.robust_motion import ConsensusOptions, Pairs, motions_of
 from tofuse.engine.clouds.robust_motion import consensus as consensus_of
@@ -60,11 +61,6 @@ SECOND = se3.exp(np.array([0.4, 0.1, 0.2, -0.05, -0.42, 0.08]))
 TRUE = se3.inverse(FIRST) @ SECOND
 
 
-def off(found, true=TRUE):
-    gap = se3.inverse(true) @ found
-    return float(np.linalg.norm(gap[:3, 3])), float(np.degrees(se3.angle(gap)))
-
-
 @pytest.fixture(scope="module")
 def images():
     """Source and target."""
@@ -98,7 +94,7 @@ def test_inliers_are_separated_from_outliers(method, right, wrong):
         missed = np.linalg.norm(se3.transform(T, pairs.source) - pairs.target, axis=1)
         most = np.count_nonzero(missed < 0.03)  # three standard deviations
         found = consensus(pairs, SampleOptions(method=method), np.random.default_rng(seed))
-        shift, turn = off(found[0].T_target_source, T)
+        shift, turn = pose_error(found[0].T_target_source, T)
         assert shift < 0.03
         assert turn < 0.6
         assert np.count_nonzero(found[0].inliers[:right]) >= 0.95 * most
@@ -112,7 +108,7 @@ def test_one_inlier_in_fifty_pairs_is_enough(seed):
     """So few that sets of compatible pairs must be small to have no outliers."""
     pairs, T = made_pairs(10, 500, seed=seed)
     found = consensus_of(pairs, ConsensusOptions())
-    shift, turn = off(found[0].T_target_source, T)
+    shift, turn = pose_error(found[0].T_target_source, T)
     assert shift < 0.06
     assert turn < 2
 
@@ -190,7 +186,7 @@ def test_inconsistent_pairs_are_rejected(method):
 @pytest.mark.parametrize("detector", ["sift", "orb", "fast"])
 def test_distant_images_are_registered_without_guess(images, detector):
     found = tofuse.register(*images, method=Features(detector))
-    shift, turn = off(found.T_target_source)
+    shift, turn = pose_error(found.T_target_source, TRUE)
     assert shift < (0.08 if detector == "orb" else 0.05)  # localizes to a pixel of a coarse image
     assert turn < 1.5
     assert found.margin > 0.2
@@ -206,7 +202,7 @@ def test_colour_images_are_registered(images):
         image = np.dstack([level] * 3)
         colored.append(replace(frame, amplitude_image=None, color_image=image, index=k))
     found = tofuse.register(*colored, method=Features(channel="color"))
-    assert off(found.T_target_source)[0] < 0.05
+    assert pose_error(found.T_target_source, TRUE)[0] < 0.05
     np.testing.assert_array_equal(
         found.T_target_source, tofuse.register(*colored, method=Features()).T_target_source
     )

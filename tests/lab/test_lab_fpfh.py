@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import tofuse
+from pose_errors import pose_error
 from registration_scenes import rng, stone, turn
 from searched_pair import TRUE, A, B, seen
 from tofuse.engine.geometry import se3
@@ -18,13 +19,6 @@ def corners():
     return seen(B, seed=1).points.astype(float), seen(A, seed=2).points.astype(float)
 
 
-def off(found, true, points):
-    """Distance in m between the images of the median point, and angle in degrees."""
-    middle = np.median(points, 0)[None]
-    shift = se3.transform(found, middle) - se3.transform(true, middle)
-    return float(np.linalg.norm(shift)), float(np.degrees(se3.angle(se3.inverse(true) @ found)))
-
-
 @pytest.mark.parametrize("degrees", [30, 75, 120, 180])
 def test_partially_overlapping_views_under_any_rotation(corners, degrees):
     source, target = corners
@@ -32,7 +26,7 @@ def test_partially_overlapping_views_under_any_rotation(corners, degrees):
     strange = rng(7).uniform(source.min(0), source.max(0), (len(source) // 10, 3))
     moved = se3.transform(se3.inverse(turned), np.vstack([source, strange]))
     found = tofuse.register(moved, target, method=Fpfh())
-    shift, angle = off(found.T_target_source, TRUE @ turned, moved)
+    shift, angle = pose_error(found.T_target_source, TRUE @ turned, moved)
     assert shift < 0.01
     assert angle < 0.3
     assert found.margin > 0

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import tofuse
-from searched_pair import TRUE, A, B, error, seen
+from pose_errors import pose_error
+from searched_pair import TRUE, A, B, seen
 from tofuse.engine.geometry import se3
 from tofuse.engine.search.plane_detection import detect_planes
 from tofuse.engine.views.prepared_view import prepare_view
@@ -41,7 +42,7 @@ def test_detected_planes_match_scene():
 
 def test_furnished_corner_is_registered_without_guess():
     found = tofuse.register(seen(B, seed=1), seen(A, seed=2), method=PlaneSets())
-    shift, angle = error(found.T_target_source, TRUE)
+    shift, angle = pose_error(found.T_target_source, TRUE)
     assert shift < 0.05
     assert angle < 1.5
     assert found.correspondences >= 3

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from made_rooms import OTHER, at, seen, surface
+from pose_errors import assert_near, pose_error
 from tofuse.engine.alignment.base import Link, Registration
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops.join_checks import JoinChecks
@@ -69,9 +70,7 @@ def assert_joined(group, stretches, path=PATH, metres=0.02, degrees=0.5):
     began = {s.component: int(s.frames[0]) for s in stretches}
     assert began[first] == min(began[c] for c in group.T_group_component)
     for c, T in group.T_group_component.items():
-        off = se3.inverse(se3.inverse(path[began[first]]) @ path[began[c]]) @ T
-        assert np.linalg.norm(off[:3, 3]) < metres
-        assert np.degrees(se3.angle(off)) < degrees
+        assert_near(T, se3.inverse(path[began[first]]) @ path[began[c]], metres, degrees)
 
 
 def members(groups):
@@ -97,8 +96,7 @@ def test_components_of_one_path_are_joined_without_given_links(three) -> None:
     for join in group.joins:
         assert join.kind == "links"
         true = se3.inverse(PATH[join.link.i]) @ PATH[join.link.j]
-        off = se3.inverse(true) @ join.link.T_i_j
-        assert np.linalg.norm(off[:3, 3]) < 0.02
+        assert pose_error(join.link.T_i_j, true)[0] < 0.02
 
 
 def test_given_links_are_used(three) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from made_rooms import OTHER, at, seen
+from pose_errors import assert_near
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops.joining import Joining
@@ -55,9 +56,7 @@ def assert_right(trajectory, places, rows, metres=0.02, degrees=0.7):
     first = rows[0]
     for k in rows[1:]:
         true = se3.inverse(PATH[places[first]]) @ PATH[places[k]]
-        off = se3.inverse(true) @ se3.inverse(trajectory[first]) @ trajectory[k]
-        assert np.linalg.norm(off[:3, 3]) < metres
-        assert np.degrees(se3.angle(off)) < degrees
+        assert_near(se3.inverse(trajectory[first]) @ trajectory[k], true, metres, degrees)
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 
+from pose_errors import assert_near
 from tofuse.apps.rigs.calibrating import calibrate_cameras
 from tofuse.apps.rigs.inputs import open_cameras
 from tofuse.apps.rigs.joint import RigView, disagreements
@@ -22,9 +23,7 @@ def test_surfaces_agree_better_than_under_reference_poses(shared_data) -> None:
     T = np.array([np.reshape(reference[camera.name], (4, 4)) for camera in cameras])
     T = se3.inverse(T[0]) @ T
     # COLMAP's poses are accurate to 1 or 2 cm and about a degree.
-    off = se3.inverse(np.array([c.T_rig_camera for c in rig.cameras])) @ T
-    assert np.linalg.norm(off[:, :3, 3], axis=1).max() < 0.04
-    assert np.degrees(se3.angle(off)).max() < 1.5
+    assert_near(np.array([c.T_rig_camera for c in rig.cameras]), T, 0.04, 1.5)
     views = [
         RigView(k, 0, SampledView.of(camera.surface(camera.images(1)[0]), 4000))
         for k, camera in enumerate(cameras)

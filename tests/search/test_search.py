@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from searched_pair import TRUE, A, B, camera, error, seen
+from pose_errors import pose_error
+from searched_pair import TRUE, A, B, camera, seen
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import search_kernels as kernels
 from tofuse.engine.search.pair_agreement import agreement
@@ -279,7 +280,7 @@ def test_rough_planes_fill_noisy_regions():
 @pytest.mark.parametrize("mode", ["planar", "full", "auto", "both"])
 def test_large_step_is_found_without_guess(pair, mode):
     found = search(*pair, SearchOptions(mode=mode))
-    metres, degrees = error(found.T_target_source, TRUE)
+    metres, degrees = pose_error(found.T_target_source, TRUE)
     assert metres < 0.02
     assert degrees < 0.5
     assert found.score > 0.4
@@ -305,7 +306,7 @@ def test_albedo_resolves_geometric_ambiguity():
         assert 20 < np.degrees(se3.angle(true)) < 30
         for name, seen_by in (("with", views), ("without", dark)):
             found = search(seen_by[k + 1], seen_by[k])
-            metres, degrees = error(found.T_target_source, true)
+            metres, degrees = pose_error(found.T_target_source, true)
             right[name] += metres < 0.1 and degrees < 3
             if name == "with":
                 assert found.agreement.clash < 0.01
@@ -327,6 +328,6 @@ def test_recorded_views_are_found_without_guess(shared_data):
     views = [prepare_view(frame, SurfaceOptions()) for frame in recording]
     for i, j in ((3, 2), (6, 5), (16, 0)):
         found = search(views[i], views[j])
-        metres, degrees = error(found.T_target_source, se3.inverse(poses[j]) @ poses[i])
+        metres, degrees = pose_error(found.T_target_source, se3.inverse(poses[j]) @ poses[i])
         assert metres < 0.15, (i, j)
         assert degrees < 4, (i, j)

@@ -9,6 +9,7 @@ import pytest
 
 import tofuse
 from made_rooms import BOXES, CAMERA, OTHER, at, seen, surface
+from pose_errors import pose_error
 from tofuse.engine.alignment.base import PROBABLE
 from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
 from tofuse.engine.cameras.cameras import RayTable
@@ -26,12 +27,6 @@ A, B = at(-0.4, 0.3, 0.1), at(-0.1, 0.7, 0.8)
 TRUE = se3.inverse(A) @ B
 
 
-def error(found, true=TRUE):
-    """Metres and degrees."""
-    gap = se3.inverse(true) @ found
-    return np.linalg.norm(gap[:3, 3]), np.degrees(se3.angle(gap))
-
-
 @pytest.fixture(scope="module")
 def pair():
     """Source and target."""
@@ -44,7 +39,7 @@ def far(pair):
 
 
 def test_distant_pair_is_found_and_accepted(far):
-    metres, degrees = error(far.T_target_source)
+    metres, degrees = pose_error(far.T_target_source, TRUE)
     assert metres < 0.02
     assert degrees < 0.5
     assert far.believed
@@ -77,7 +72,7 @@ def test_amplitude_falloff_is_estimated(pair, far, exponent):
     assert found.support == pytest.approx(known.support, abs=0.005)
     assert found.score == pytest.approx(known.score, abs=0.01)
     found = tofuse.register(*(falling(frame, exponent) for frame in pair))
-    metres, degrees = error(found.T_target_source, far.T_target_source)
+    metres, degrees = pose_error(found.T_target_source, far.T_target_source)
     assert metres < 0.01
     assert degrees < 0.2
 
@@ -105,7 +100,7 @@ def test_camera_on_its_side_is_found(quarters):
     roll = np.eye(4)
     roll[:2, :2] = turn
     found = tofuse.register(source, seen(A, 0))
-    metres, degrees = error(found.T_target_source @ roll, se3.inverse(A) @ at(-0.3, 0.4, 0.4))
+    metres, degrees = pose_error(found.T_target_source @ roll, se3.inverse(A) @ at(-0.3, 0.4, 0.4))
     assert metres < 0.02
     assert degrees < 0.5
     assert found.believed
@@ -151,7 +146,7 @@ def test_repetitive_room_is_ambiguous():
     found = tofuse.register(source, target)
     assert not found.believed
     assert found.margin < 0.1
-    metres, degrees = error(found.runner_up, found.T_target_source)
+    metres, degrees = pose_error(found.runner_up, found.T_target_source)
     assert metres > 0.05 or degrees > 4.9
     assert "another pose fits nearly as well" in found.reason
 
@@ -162,14 +157,14 @@ def test_good_guess_is_used_without_search(pair):
     found = tofuse.register(near, pair[1], guess=true @ se3.exp([0.02, 0, 0.02, 0, 0.03, 0]))
     assert found.margin is None  # no rival was evaluated
     assert found.believed
-    assert error(found.T_target_source, true)[0] < 0.01
+    assert pose_error(found.T_target_source, true)[0] < 0.01
 
 
 def test_wrong_guess_is_not_trusted(pair, far):
     for wrong in ([0.8, 0, -0.5, 0, 0.6, 0], [0, 0.6, 0, 0.4, 0, 0.3]):
         found = tofuse.register(*pair, guess=se3.exp(wrong))
         assert found.believed
-        assert error(found.T_target_source, far.T_target_source)[0] < 0.02
+        assert pose_error(found.T_target_source, far.T_target_source)[0] < 0.02
 
 
 def test_small_scene_is_registered_like_large_one(pair, far):
@@ -243,12 +238,12 @@ def test_alignment_is_accepted_if_consistent_in_both_directions(pair):
     target, source = surface(pair[1]), surface(seen(A @ true, 8))
     found = follow(source, target, np.eye(4))
     assert found.margin is None  # no rival was evaluated
-    assert error(found.T_target_source, true)[0] < 0.01
+    assert pose_error(found.T_target_source, true)[0] < 0.01
     back = follow(target, source, np.eye(4))
-    assert error(back.T_target_source, se3.inverse(true))[0] < 0.01
+    assert pose_error(back.T_target_source, se3.inverse(true))[0] < 0.01
     # From a distant start nothing is found, rather than a wrong pose.
     off = follow(source, target, se3.exp([0.5, 0.2, 0.6, 0.2, 1.2, 0]))
-    assert off is None or error(off.T_target_source, true)[0] < 0.02
+    assert off is None or pose_error(off.T_target_source, true)[0] < 0.02
 
 
 def test_large_margin_outweighs_degenerate_directions():

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pose_errors import assert_near
 from tofuse.engine.geometry import se3
 from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.formats.recordings.open import open_recording
@@ -62,12 +63,6 @@ def run(frames, options=None, odometry=None):
 def components(steps):
     """Number of each frame's component; None where it is lost."""
     return [None if s.T_component_camera is None else s.component for s in steps]
-
-
-def assert_near(T, true, metres=0.015, degrees=0.6):
-    off = se3.inverse(true) @ T
-    assert np.linalg.norm(off[:3, 3]) < metres
-    assert np.degrees(se3.angle(off)) < degrees
 
 
 def assert_right(steps, poses, metres=0.015, degrees=0.6):
