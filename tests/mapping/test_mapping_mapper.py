@@ -14,6 +14,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.filters.base import Filter
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import Optimisation, Optimiser
 from tofuse.engine.loops.loops import PriorLoop
 from tofuse.engine.mapping.config import changed
@@ -104,6 +105,43 @@ def test_order_kind_and_end_are_checked(frames) -> None:
     for call in (lambda: mapper.push(frames[5]), mapper.finish, lambda: mapper.skip(6, 0.0, "")):
         with pytest.raises(InputError, match="mapper: is finished; make a new Mapper"):
             call()
+
+
+@pytest.mark.parametrize(
+    ("sensor", "problem"),
+    [
+        ({"T_odometry": np.diag([1.0, 1, -1, 1])}, "T_odometry.*no rotation"),
+        ({"T_odometry": np.eye(4)[:3]}, "T_odometry"),
+        ({"T_odometry": "x"}, "T_odometry"),
+        ({"gravity": np.zeros(4)}, "gravity: has the length 0"),
+        ({"gravity": [0, 9.81, 0, 0.01]}, "gravity: has the length 9.81"),
+        ({"gravity": [0, 1, 0, -0.01]}, "a sigma of -0.01"),
+        ({"gravity": [0, 1, 0]}, r"gravity: has shape \(3,\)"),
+        ({"gravity": "down"}, "gravity"),
+    ],
+)
+def test_wrong_sensor_data_is_refused_and_costs_no_map(frames, sensor, problem) -> None:
+    mapper = Mapper(CONFIG)
+    mapper.push(frames[0], T_odometry=np.eye(4).tolist(), gravity=[0, 1, 0, 0.01])
+    with pytest.raises(InputError, match=problem):
+        mapper.push(frames[1], **sensor)
+    unknown = np.full((4, 4), np.nan)
+    mapper.push(frames[1], T_odometry=unknown, gravity=unknown[0])
+    assert mapper.log.entries[1].T_odometry is None
+    assert mapper.log.entries[1].gravity is None
+    assert mapper.finish().has_pose.all()
+
+
+def test_loops_are_given_as_pairs() -> None:
+    T = se3.exp([0.1, 0, 0, 0, 0.2, 0])
+    (i, j, given) = (PriorLoop.of((7, 2, T)).i, PriorLoop.of([2, 7]).j, PriorLoop.of((7, 2, T)))
+    assert (i, j, PriorLoop.of((2, 7)).T_i_j) == (2, 7, None)
+    np.testing.assert_allclose(given.T_i_j, se3.inverse(T))
+    assert PriorLoop.of(PriorLoop(2, 7, by_user=False)).by_user is False
+    wrong = (3, "12", [(1,)], [(1, 1)], [(-1, 2)], [(0.5, 2)], [("0", "1")], [(0, 1, np.eye(3))])
+    for loops in wrong:
+        with pytest.raises(InputError, match="loops"):
+            Mapper(loops=loops)
 
 
 def test_no_frames_and_no_usable_frames_are_refused(frames) -> None:

@@ -40,7 +40,14 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
-from tofuse.engine.mapping import Config, adaptation, changed, from_method, reconstructing
+from tofuse.engine.mapping import (
+    Config,
+    adaptation,
+    changed,
+    checked,
+    from_method,
+    reconstructing,
+)
 from tofuse.engine.mapping import Mapper as OnlineMapper
 from tofuse.engine.parts import name_of
 from tofuse.engine.progress import Progress, Silent
@@ -295,7 +302,7 @@ class Mapper(OnlineMapper):
     threads
         Number of threads; None: all cores. The result does not depend on it.
     loops
-        Given loops, in frame indices.
+        Given loops, in frame indices: pairs (i, j), or (i, j, T_i_j) with the measured motion.
     progress
         Receives frames and stages.
     tracker
@@ -319,7 +326,7 @@ def reconstruct(
     *,
     seed: int = 0,
     threads: int | None = None,
-    loops: Sequence[PriorLoop] = (),
+    loops: Sequence[PriorLoop | Sequence[Any]] = (),
     prior: adaptation.Prior = "auto",
     progress: Progress | bool | None = None,
 ) -> Result:
@@ -340,7 +347,8 @@ def reconstruct(
     threads
         Number of threads; None: all cores. The result does not depend on it.
     loops
-        Known loop closures, in frame indices.
+        Known loop closures, in frame indices: pairs (i, j), or (i, j, T_i_j) with the measured
+        motion.
     prior
         Measurements of other sensors to use, as ``--prior`` of `tofuse run`: "auto" uses gravity,
         and a phone's own poses, "none" the images alone, "device" the recorded odometry too.
@@ -382,7 +390,7 @@ def _configuration(config: Config | str | Mapping[str, Any], recording: Recordin
     if isinstance(config, Mapping):
         options = {name: value for name, value in config.items() if name != "method"}
         return changed(from_method(config.get("method", "default"), kind), options, where="config")
-    return config
+    return checked(config)
 
 
 def merge(

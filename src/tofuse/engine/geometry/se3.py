@@ -215,7 +215,10 @@ def largest_sigmas(C: ArrayLike) -> Float64:
 
 def check_pose(T: ArrayLike, *, where: str = "pose") -> Float64:
     """Return T as a float64 (4, 4) array, or raise InputError if it is not a rigid motion."""
-    T = np.asarray(T, float)
+    try:
+        T = np.asarray(T, float)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError("is not a matrix of numbers", where=where) from error
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise InputError("is not a finite 4x4 matrix", where=where)
     R = T[:3, :3]

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar, Protocol
+from typing import Annotated, Any, ClassVar, Protocol
 
 import numpy as np
 
 from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
-from tofuse.engine.errors import RegistrationError
+from tofuse.engine.errors import InputError, RegistrationError
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import LoopRecord
 from tofuse.engine.icp import algorithm_1
+from tofuse.engine.parts import check_number
 from tofuse.engine.search import SearchOptions
 from tofuse.engine.stored_views import ViewStore
 from tofuse.engine.views import PreparedView
@@ -39,6 +40,32 @@ class PriorLoop:
     j: int
     T_i_j: Float64 | None = None
     by_user: bool = True
+
+    @classmethod
+    def of(cls, loop: PriorLoop | Sequence[Any]) -> PriorLoop:
+        """Return a loop that the user gives, also as (i, j) or (i, j, T_i_j), in any order.
+
+        Raises
+        ------
+        InputError
+            If it does not join two frames, or the motion is not rigid.
+        """
+        given = (loop.i, loop.j, loop.T_i_j) if isinstance(loop, PriorLoop) else loop
+        if not isinstance(given, Sequence) or isinstance(given, str) or len(given) not in (2, 3):
+            remedy = "pass pairs (i, j) of frame indices, or (i, j, T_i_j)"
+            raise InputError(f"contains {loop!r}", where="loops", remedy=remedy)
+        i, j, *motion = given
+        for index in (i, j):
+            check_number(index, Bounds(0), f"loops: {i!r} {j!r}", whole=True)
+        if i == j:
+            raise InputError("joins a frame with itself", where=f"loops: {i} {j}")
+        T = motion[0] if motion else None
+        if T is not None:
+            T = se3.check_pose(T, where=f"loops: {i} {j}")
+        by_user = loop.by_user if isinstance(loop, PriorLoop) else True
+        if i < j:
+            return cls(int(i), int(j), T, by_user)
+        return cls(int(j), int(i), None if T is None else se3.inverse(T), by_user)
 
     def about(self, centre: Float64) -> PriorLoop:
         """Return the loop with its motion in coordinates with another origin; see `se3.about`."""

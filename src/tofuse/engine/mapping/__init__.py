@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         ViewKind,
         changed,
         check_views,
+        checked,
         kind_of,
     )
     from tofuse.engine.mapping.frame_log import FrameLog

@@ -112,6 +112,17 @@ class Config(Bounded):
         return dict(parts.to_dict(self))
 
 
+def checked(config: Any) -> Config:
+    """Return the configuration, or raise InputError if it is none."""
+    if not isinstance(config, Config):
+        raise InputError(
+            f"is a {type(config).__name__}, not a configuration",
+            where="config",
+            remedy='pass the name of one, such as "default", or a Config',
+        )
+    return config
+
+
 PACKAGES = (
     "tofuse.engine.filters",
     "tofuse.engine.sensor",

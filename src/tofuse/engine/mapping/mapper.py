@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
@@ -18,7 +20,7 @@ from tofuse.engine.mapping import adaptation
 from tofuse.engine.mapping.assembly import Assembly
 from tofuse.engine.mapping.backend import Job
 from tofuse.engine.mapping.color_frames import ColorFrames
-from tofuse.engine.mapping.config import Config, check_views, kind_of
+from tofuse.engine.mapping.config import Config, check_views, checked, kind_of
 from tofuse.engine.mapping.frame_log import FrameLog, FrameSequence, record_of
 from tofuse.engine.mapping.live_poses import LivePoses
 from tofuse.engine.mapping.methods import from_method
@@ -31,6 +33,8 @@ from tofuse.engine.stopwatch import current, timing
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.tracking import FrameTime, Step, Tracker
 from tofuse.engine.views import PreparedView
+
+_UNIT = 1e-3  # tolerance of the length of a unit vector
 
 
 class Mapper:
@@ -50,7 +54,7 @@ class Mapper:
     threads
         Number of threads; None: all cores. The result does not depend on it.
     loops
-        Given loops, in frame indices.
+        Given loops, in frame indices: pairs (i, j), or (i, j, T_i_j) with the measured motion.
     progress
         Receives frames and stages.
     tracker
@@ -68,19 +72,22 @@ class Mapper:
         *,
         seed: int = 0,
         threads: int | None = None,
-        loops: Sequence[PriorLoop] = (),
+        loops: Sequence[PriorLoop | Sequence[Any]] = (),
         progress: Progress | None = None,
         tracker: Tracker | None = None,
         surface: bool = True,
         colors: ColorFrames | None = None,
     ) -> None:
         check_number(seed, Bounds(0), "seed", whole=True)
-        self.config = from_method(config) if isinstance(config, str) else config
+        self.config = from_method(config) if isinstance(config, str) else checked(config)
         self._method = config if isinstance(config, str) else None
         self.seed = seed
         self.threads = threads if threads is not None else thread_count()
         self.watch = current()
-        self._prior_loops, self._surface = tuple(loops), surface
+        self._prior_loops, self._surface = _prior_loops(loops), surface
+        if progress is True:
+            remedy = "pass an object that receives it; `reconstruct` shows it on the terminal"
+            raise InputError("is True", where="progress", remedy=remedy)
         self._progress = progress or Silent()
         self._sequence = FrameSequence()
         self._log = FrameLog()
@@ -104,8 +111,8 @@ class Mapper:
         self,
         frame: Frame,
         *,
-        T_odometry: Float64 | None = None,
-        gravity: Float64 | None = None,
+        T_odometry: ArrayLike | None = None,
+        gravity: ArrayLike | None = None,
         history: Sequence[Frame] | None = None,
         prepared: Prepared | None = None,
     ) -> Float64 | None:
@@ -116,10 +123,12 @@ class Mapper:
         frame
             Uncorrected and unfiltered. Its `index` must be larger than those before.
         T_odometry
-            (4, 4) T_world_camera from odometry or a phone, in any fixed world frame. It is a
-            prior if the configuration has the part "odometry", or is a name and uses gravity.
+            (4, 4) T_world_camera from odometry or a phone, in any fixed world frame; None or NaN
+            where there is none. It is a prior if the configuration has the part "odometry", or is
+            a name and uses gravity.
         gravity
-            (4,) unit vector of gravity in the camera's frame, and its sigma in rad.
+            (4,) unit vector of gravity in the camera's frame, and its sigma in rad; None or NaN
+            where there is none.
         history
             Unfiltered frames just before this one, oldest first, for temporal filters; by default
             the frames pushed before.
@@ -136,9 +145,11 @@ class Mapper:
         ------
         InputError
             If the frame is of another kind than those before, or of one that the configuration
-            does not support, or its index is not larger than those before.
+            does not support, or its index is not larger than those before; if the odometry is no
+            rigid motion, or gravity no direction. The mapper is as before, and goes on.
         """
-        frame, T_odometry = self._check(frame, T_odometry)
+        T_given, down = _odometry(T_odometry), _direction(gravity)
+        frame, T_given = self._check(frame, T_given)
         repeated = self._sequence.is_repeated(frame)
         if repeated:
             self._log.repeated.append(frame.index)
@@ -146,9 +157,9 @@ class Mapper:
         busy = prepared is not None and prepared.filtered is not None
         with threads(self.threads, serial=busy), self.watch.running(), timing("tracking"):
             filtered = self._prepare(frame, history, prepared)
-            step = self._track(filtered, T_odometry, repeated)
+            step = self._track(filtered, T_given, repeated)
             record = record_of(filtered.corrected, step, frame.mean_depth)
-            self._log.add(record, step, T_odometry, gravity)
+            self._log.add(record, step, T_given, down)
             self._store(filtered, step)
             with timing("loops"):
                 self._live_poses.update(step, self._log)
@@ -331,3 +342,39 @@ class Mapper:
     def _check_open(self) -> None:
         if self._finished:
             raise InputError("is finished", where="mapper", remedy="make a new Mapper")
+
+
+def _prior_loops(loops: Sequence[PriorLoop | Sequence[Any]]) -> tuple[PriorLoop, ...]:
+    if not isinstance(loops, Sequence) or isinstance(loops, str):
+        raise InputError(
+            f"is a {type(loops).__name__}", where="loops", remedy="pass a list of pairs (i, j)"
+        )
+    return tuple(PriorLoop.of(loop) for loop in loops)
+
+
+def _odometry(T: ArrayLike | None) -> Float64 | None:
+    """Return the pose (4, 4) of odometry; None where it is unknown."""
+    if T is None:
+        return None
+    pose: Float64 = se3.check_poses([T], where="T_odometry", count=1)[0]
+    return None if se3.is_unknown(pose) else pose
+
+
+def _direction(gravity: ArrayLike | None) -> Float64 | None:
+    """Return the unit vector of gravity and its sigma (4,); None where it is unknown."""
+    if gravity is None:
+        return None
+    remedy = "pass the unit vector in the camera's frame, and its sigma in rad"
+    try:
+        values = np.array(gravity, float)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError("is not an array of numbers", where="gravity", remedy=remedy) from error
+    if values.shape != (4,):
+        raise InputError(f"has shape {values.shape}", where="gravity", remedy=remedy)
+    if np.isnan(values).any():
+        return None
+    length, sigma = np.linalg.norm(values[:3]), values[3]
+    if not (abs(length - 1) <= _UNIT and 0 < sigma < np.inf):
+        problem = f"has the length {length:.3g}, and a sigma of {sigma:.3g}"
+        raise InputError(problem, where="gravity", remedy=remedy)
+    return values

@@ -90,6 +90,6 @@ def methods() -> dict[str, Callable[[ViewKind], Config]]:
 def from_method(name: str, kind: ViewKind = "range") -> Config:
     """Return the configuration of that name for a kind of view; InputError if there is none."""
     available = methods()
-    if name not in available:
+    if not isinstance(name, str) or name not in available:
         raise InputError(f"is {name!r}", where="--method", remedy=f"use one of {list(available)}")
     return available[name](kind)

@@ -54,7 +54,7 @@ def reconstruct(
     *,
     seed: int = 0,
     threads: int | None = None,
-    loops: Sequence[PriorLoop] = (),
+    loops: Sequence[PriorLoop | Sequence[Any]] = (),
     progress: Progress | None = None,
     tracked_frames: TrackedFrames | None = None,
 ) -> Reconstruction:
@@ -123,7 +123,7 @@ def _track(
     config: Config,
     seed: int,
     threads: int | None,
-    loops: Sequence[PriorLoop],
+    loops: Sequence[PriorLoop | Sequence[Any]],
     progress: Progress,
     tracked_frames: TrackedFrames | None = None,
     *,
