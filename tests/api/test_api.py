@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -228,6 +229,8 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
     [
         ({"depth": np.ones((60, 80))}, "depth"),
         ({"depth": []}, "depth"),
+        ({"depth": np.ones((6, 60, 80), bool)}, "depth"),
+        ({"depth": [np.ones((60, 80)), np.ones((60, 80), np.uint16)]}, "integers and floats"),
         ({"depth": np.full((2, 60, 80), 1500.0)}, "depth_unit_m"),
         ({"depth": [np.ones((60, 80)), np.ones((60, 81))]}, "depth"),
         ({"depth_unit_m": 0.0}, "depth_unit_m"),
@@ -290,6 +293,8 @@ def test_slow_cameras_and_parts_of_images_are_accepted(arrays, times):
         ({"index": "0"}, "index"),
         ({"timestamp": np.nan}, "timestamp"),
         ({"timestamp": None}, "timestamp"),
+        ({"timestamp": 1e300}, "timestamp"),
+        ({"index": 2**63}, "index"),
         ({"camera": None}, "camera"),
         ({"depth": [[1.0]]}, "depth"),
         ({"depth": np.ones(60)}, "depth"),
@@ -303,9 +308,19 @@ def test_unusable_frames_are_rejected(arrays, change, named):
         tofuse.RangeFrame(**given)
 
 
+def test_negative_amplitude_is_none(arrays) -> None:
+    amplitude = np.full(arrays[0].shape, 100.0)
+    amplitude[:, :30] = -5
+    amplitude[:, 30:32] = -np.inf
+    amplitude[:, 32:34] = np.inf
+    frame = tofuse.from_arrays(arrays[0], arrays[1], amplitude=amplitude)[0]
+    assert np.unique(frame.amplitude_image).tolist() == [0, 100, 65535]
+
+
 def test_wrong_arguments_are_named(arrays, result, tmp_path):
     recording = tofuse.from_arrays(*arrays[:2])
     far = np.full((20, 3), 1e20, np.float32)
+    cloud = partial(tofuse.CloudFrame.of, np.where(np.arange(60) < 3, np.nan, 1).reshape(20, 3))
     for call, named in (
         (lambda: tofuse.open(None), "path: is a NoneType"),
         (lambda: tofuse.open([tmp_path]), "path: is a list"),
@@ -321,7 +336,16 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: tofuse.reconstruct(recording, seed=-1), "seed: is -1"),
         (lambda: tofuse.register(recording[0], recording[1], seed=1.5), "seed: is 1.5"),
         (lambda: tofuse.Mapper().push(arrays[0][0]), "frame: is a ndarray"),
+        (lambda: tofuse.Mapper({}), "config: is a dict"),
+        (lambda: tofuse.Mapper(progress=True), "progress: is True"),
+        (lambda: tofuse.reconstruct(recording, None), "config: is a NoneType"),
+        (lambda: tofuse.reconstruct(recording, {"method": []}), r"is \[\]; use one of"),
+        (lambda: tofuse.reconstruct(recording, loops=[(0, "a")]), "loops: 0 'a'"),
+        (lambda: tofuse.register(*recording[:2], guess="eye"), "guess: is not a matrix"),
         (lambda: tofuse.CloudFrame(0, 0.0, far), r"coordinates up to 1e\+20"),
+        (lambda: cloud(origin=np.full(3, np.nan)), "frame 0: origin"),
+        (lambda: cloud(normals=np.ones((3, 3))), "frame 0: normals: has shape"),
+        (lambda: cloud(amplitude=np.ones((20, 1))), "frame 0: amplitude: has shape"),
     ):
         with pytest.raises(tofuse.InputError, match=named):
             call()

@@ -6,6 +6,7 @@ of clouds needs. All arrays are read-only by convention: methods return new fram
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal, Self, get_args
@@ -139,9 +140,10 @@ class RangeFrame:
             depth = np.where(valid, depth, np.float32(0))
         object.__setattr__(self, "depth", depth)
         amplitude = self.amplitude_image
-        if amplitude is not None and np.isinf(amplitude).any():
-            amplitude = np.nan_to_num(amplitude, nan=np.nan, posinf=SATURATED_AMPLITUDE, neginf=0)
-            object.__setattr__(self, "amplitude_image", amplitude)
+        if amplitude is not None and ((amplitude < 0) | (amplitude == np.inf)).any():
+            amplitude = np.where(amplitude < 0, 0, amplitude)
+            amplitude = np.where(amplitude == np.inf, SATURATED_AMPLITUDE, amplitude)
+            object.__setattr__(self, "amplitude_image", amplitude.astype(np.float32))
 
     @property
     def shift(self) -> Float64:
@@ -272,6 +274,13 @@ class CloudFrame:
                 where=f"frame {self.index}",
                 remedy="use metres, and leave out invalid points",
             )
+        for name in ("origin", "shift"):
+            place = getattr(self, name)
+            if np.shape(place) != (3,) or not np.isfinite(place).all():
+                problem = f"is {place!r}, not three finite numbers"
+                raise InputError(problem, where=f"frame {self.index}: {name}", remedy="use metres")
+        columns = {name: getattr(self, name) for name in COLUMNS}
+        _check_columns(self.index, len(self.points), columns)
 
     @classmethod
     def of(
@@ -303,6 +312,7 @@ class CloudFrame:
                 where="points",
                 remedy="pass (N, 3) numbers in metres",
             )
+        _check_columns(index, len(array), columns)
         with np.errstate(over="ignore", invalid="ignore"):  # signalling NaN as well
             shift = map_shift(array)
             array = array - shift if shift.any() else array
@@ -385,7 +395,24 @@ def map_shift(points: NDArray[np.floating]) -> Float64:
     return np.asarray(np.round(centre / _SHIFT_STEP_M) * _SHIFT_STEP_M)
 
 
+def _check_columns(index: int, count: int, columns: Mapping[str, ArrayLike | None]) -> None:
+    """Raise InputError if a column of a cloud has no value for each point."""
+    for name, column in columns.items():
+        shape = (count, 3) if name in ("points", "normals", "color") else (count,)
+        if column is not None and np.shape(column) != shape:
+            raise InputError(
+                f"has shape {np.shape(column)}, not {shape}",
+                where=f"frame {index}: {name}",
+                remedy="pass a value for each point",
+            )
+
+
+# Indices are stored as int64; intervals of longer times, of any unit, would overflow.
+_MAX_INDEX, _MAX_TIME_S = 2**53, 1e20
+
+
 def _check_frame(frame: Frame) -> None:
     """Raise InputError for an index or a timestamp that no frame can have."""
-    check_number(frame.index, Bounds(), "index of a frame", whole=True)
-    check_number(frame.timestamp, Bounds(), f"frame {frame.index}: timestamp")
+    indices, times = Bounds(-_MAX_INDEX, _MAX_INDEX), Bounds(-_MAX_TIME_S, _MAX_TIME_S)
+    check_number(frame.index, indices, "index of a frame", whole=True)
+    check_number(frame.timestamp, times, f"frame {frame.index}: timestamp")

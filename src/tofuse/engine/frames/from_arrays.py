@@ -78,8 +78,14 @@ def from_arrays(
     InputError
         If shapes or types do not fit, or the depth can't be in the assumed unit.
     """
-    images = _images("depth", depth, None)
+    images = _images("depth", depth, None, "iuf")
     shape = images[0].shape
+    if len({image.dtype.kind == "f" for image in images}) > 1:
+        raise InputError(
+            "contains integers and floats, which are in different units",
+            where="depth",
+            remedy="pass images of one type",
+        )
     if len(shape) != 2:
         raise InputError(f"has images of shape {shape}", where="depth", remedy="pass (N, H, W)")
     checked_camera = _camera(camera, shape, len(images))
@@ -113,7 +119,9 @@ def from_arrays(
     return Recording.of(source, "arrays", "arrays")
 
 
-def _images(name: str, values: Any, shape: tuple[int, ...] | None) -> list[NDArray[Any]]:
+def _images(
+    name: str, values: Any, shape: tuple[int, ...] | None, kinds: str = "iufb"
+) -> list[NDArray[Any]]:
     try:
         images = [np.asarray(image) for image in values]
     except TypeError as error:
@@ -124,7 +132,7 @@ def _images(name: str, values: Any, shape: tuple[int, ...] | None) -> list[NDArr
         raise InputError("contains no image", where=name)
     expected = images[0].shape if shape is None else shape
     for k, image in enumerate(images):
-        if image.dtype.kind not in "iufb" or image.shape != expected:
+        if image.dtype.kind not in kinds or image.shape != expected:
             raise InputError(
                 f"image {k} is {image.dtype} of shape {image.shape}, not {expected}",
                 where=name,
@@ -154,7 +162,7 @@ def _optional(
 def _to_metres(
     images: list[NDArray[Any]], unit_m: float | None
 ) -> Callable[[NDArray[Any]], Float64]:
-    is_integer = images[0].dtype.kind in "iub"
+    is_integer = images[0].dtype.kind in "iu"
     scale = unit_m if unit_m is not None else (_MILLIMETRES if is_integer else 1.0)
     check_number(scale, Bounds(0, exclusive=True), "depth_unit_m")
     if unit_m is None and not is_integer:
