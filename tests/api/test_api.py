@@ -247,6 +247,11 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
         ({"depth_kind": "Z"}, "depth_kind: is 'Z'; use one of z, range"),
         ({"timestamps": list("abcdef")}, "timestamps"),
         ({"camera": [[70, 0.5, 40], [0, 70, 30], [0, 0, 1]]}, "skew"),
+        (
+            {"camera": [[0.9, 0, 0.5], [0, 1.2, 0.5], [0, 0, 1]]},
+            "multiply normalised focal lengths",
+        ),
+        ({"camera": [[7e5, 0, 40], [0, 7e5, 30], [0, 0, 1]]}, "use pixels of these images"),
         ({"amplitude_kind": "x"}, "use one of raw, range_compensated, ir"),
         (
             {"camera": [[70, 0, 95], [0, 70, 30], [0, 0, 1]]},

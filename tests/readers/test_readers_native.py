@@ -383,7 +383,7 @@ def test_writer_refuses_invalid_frames(tmp_path: Path) -> None:
         writer.add(image(1, color_image=None))
     with pytest.raises(InputError, match="40 x 31"):
         writer.add(
-            RangeFrame(1, 0.0, Pinhole(40, 31, 1.0, 1.0, 0.0, 0.0), np.ones((31, 40), np.float32))
+            RangeFrame(1, 0.0, Pinhole(40, 31, 30.0, 30.0, 0.0, 0.0), np.ones((31, 40), np.float32))
         )
     with pytest.raises(InputError, match="cloud"):
         writer.add(CloudFrame.of(np.zeros((3, 3))))

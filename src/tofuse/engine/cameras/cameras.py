@@ -340,6 +340,10 @@ DISTORTION_ORDER = {
 }
 
 
+# Sizes of images in focal lengths: fields of view of 0.06 and 172 degrees, fisheyes of more.
+_MIN_RATIO, _MAX_RATIO = 1e-3, 30.0
+
+
 def check_intrinsics(camera: Pinhole) -> None:
     """Raise InputError if a parameter of the camera is not finite or implausible."""
     for f in fields(camera):
@@ -354,6 +358,17 @@ def check_intrinsics(camera: Pinhole) -> None:
     if camera.fx <= 0 or camera.fy <= 0:
         problem, remedy = f"is {camera.fx}, {camera.fy}", "use positive focal lengths in pixels"
         raise InputError(problem, where="camera fx, fy", remedy=remedy)
+    for name, size in (("fx", camera.width), ("fy", camera.height)):
+        ratio = size / getattr(camera, name)
+        if not _MIN_RATIO <= ratio <= _MAX_RATIO:
+            raise InputError(
+                f"is {getattr(camera, name):g} pixels, for an image of {size}: a field of view of "
+                f"{np.degrees(2 * np.arctan(ratio / 2)):.4g} degrees",
+                where=f"camera {name}",
+                remedy="multiply normalised focal lengths by the size of the image"
+                if ratio > 1
+                else "use pixels of these images",
+            )
 
 
 def scaled(camera: Pinhole, width: int, height: int) -> Pinhole:

@@ -272,7 +272,7 @@ class _Fields:
             return None
         value = reading.number_in(self.data, field, self.where, remedy=f"use {hint}")
         if not math.isfinite(value):
-            raise self.error(field, f"is {value}", f"use {hint}, finite")
+            raise self.error(field, f"is {value}", "use a finite number")
         return value
 
     def positive(
