@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
@@ -19,6 +18,7 @@ from tofuse.engine.geometry import KdTree
 from tofuse.engine.icp import extent, surface_shape
 from tofuse.engine.normal import OF_95_PERCENT
 from tofuse.engine.results import Reconstruction
+from tofuse.formats.files import reading
 from tofuse.formats.geometry import is_surface, read_surface
 
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -91,7 +91,8 @@ def surface_of(given: Comparable, name: str = "") -> Surface:
     if isinstance(given, np.ndarray):
         CloudFrame.of(given)  # checks them
         return _of_record(GeometryRecord(given), name or "points")
-    path = Path(os.fspath(given))
+    remedy = "pass a result, a mesh, a cloud, (N, 3) points, or the path of one"
+    path = reading.path_of(given, name or "surface", remedy)
     if folders.is_result(path):
         return _of_result(load_result(path), str(path))
     if is_surface(path):

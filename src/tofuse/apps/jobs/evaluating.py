@@ -11,9 +11,11 @@ import numpy as np
 
 from tofuse.apps.results import folders, run_json
 from tofuse.engine.arrays import Float64
+from tofuse.engine.bounds import Bounds
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.parts import check_number
 from tofuse.engine.quality import map_agreement, trajectory_errors
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.sensor import CameraErrors, Corrector
@@ -91,6 +93,8 @@ def evaluate(
     InputError
         If a file can't be read, or nothing can be associated.
     """
+    if reference_error_m is not None:
+        check_number(reference_error_m, Bounds(0), "reference_error_m")
     if isinstance(recording, str | Path):
         recording = open_recording(recording)
     names = [

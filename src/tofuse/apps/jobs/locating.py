@@ -22,7 +22,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Camera
 from tofuse.engine.compute import threads
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import Frame, RangeFrame, Recording, evenly_spaced
+from tofuse.engine.frames import CloudFrame, Frame, RangeFrame, Recording, evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import locating
 from tofuse.engine.mapping import Config, adaptation, clips, from_method, kind_of
@@ -157,10 +157,12 @@ class ResultMap:
     def locate_frame(self, frame: Frame) -> LocatedFrame:
         """Locate a single frame."""
         if not isinstance(frame, RangeFrame):
+            kind = "cloud" if isinstance(frame, CloudFrame) else type(frame).__name__
             raise InputError(
-                "is a cloud",
-                where=f"frame {frame.index}",
-                remedy="register it with the points of the map: tofuse.register",
+                f"is a {kind}, not an image of a camera",
+                where="frame",
+                remedy="pass a frame of tofuse.open or tofuse.from_arrays; register a cloud with "
+                "the points of the map: tofuse.register",
             )
         view = clips.prepared_view(frame, self._config_of(frame))
         found = self.locator.locate([PosedView(view, np.eye(4))])

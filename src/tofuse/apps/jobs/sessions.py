@@ -69,12 +69,10 @@ def read_sessions(
         If a folder contains no result, its recording is missing, has changed or contains clouds;
         or if a result was given twice, or only one session.
     """
-    folders = [
-        reading.path_of(
-            each, "results", "pass folders, to which result.save(folder) writes results"
-        )
-        for each in results
-    ]
+    remedy = "pass folders, to which result.save(folder) writes results"
+    if isinstance(results, str | Path):
+        raise InputError("is a single path", where="results", remedy=remedy)
+    folders = [reading.path_of(each, "results", remedy) for each in results]
     for a, b in combinations(folders, 2):
         if a.resolve() == b.resolve():
             raise InputError("is given twice", where=b, remedy="pass each result once")
