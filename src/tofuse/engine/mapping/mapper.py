@@ -85,9 +85,9 @@ class Mapper:
         self.threads = threads if threads is not None else thread_count()
         self.watch = current()
         self._prior_loops, self._surface = _prior_loops(loops), surface
-        if progress is True:
+        if progress and not hasattr(progress, "began"):
             remedy = "pass an object that receives it; `reconstruct` shows it on the terminal"
-            raise InputError("is True", where="progress", remedy=remedy)
+            raise InputError(f"is {progress!r}", where="progress", remedy=remedy)
         self._progress = progress or Silent()
         self._sequence = FrameSequence()
         self._log = FrameLog()
@@ -356,7 +356,8 @@ def _odometry(T: ArrayLike | None) -> Float64 | None:
     """Return the pose (4, 4) of odometry; None where it is unknown."""
     if T is None:
         return None
-    pose: Float64 = se3.check_poses([T], where="T_odometry", count=1)[0]
+    poses: list[Any] = [T]
+    pose: Float64 = se3.check_poses(poses, where="T_odometry", count=1)[0]
     return None if se3.is_unknown(pose) else pose
 
 
