@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import textwrap
+import threading
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -97,3 +98,60 @@ def test_nothing_is_compiled_ahead_that_package_contains(tmp_path, monkeypatch) 
     monkeypatch.setattr(jit, "shipped_kernels", lambda: (tmp_path, None))
     with ahead.compiling_in_background() as is_first_run:
         assert not is_first_run
+
+
+def test_compiled_kernels_are_loaded_in_order_on_another_thread(monkeypatch) -> None:
+    loaded: list[tuple[str, object]] = []
+    everything = threading.Event()
+
+    def load(kernels) -> None:
+        loaded.extend(kernels)
+        assert threading.current_thread() is not threading.main_thread()
+        if len(loaded) == len(ahead.signatures()):
+            everything.set()
+
+    monkeypatch.setattr(ahead, "compile_all", load)
+    monkeypatch.setattr(ahead, "usable_cores", lambda: 2)
+    monkeypatch.setattr(ahead, "_are_compiled", lambda: True)
+    ahead.load_in_background.__wrapped__()
+    assert everything.wait(20)
+    assert loaded == ahead.signatures()
+
+
+@pytest.mark.parametrize(("cores", "compiled"), [(1, True), (2, False)])
+def test_nothing_is_loaded_without_a_second_core_or_compiled_kernels(
+    monkeypatch, cores: int, compiled: bool
+) -> None:
+    monkeypatch.setattr(ahead, "job_pool", None)
+    monkeypatch.setattr(ahead, "usable_cores", lambda: cores)
+    monkeypatch.setattr(ahead, "_are_compiled", lambda: compiled)
+    ahead.load_in_background.__wrapped__()
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
+def test_process_that_loads_may_fork_and_end() -> None:
+    """Neither waits for all kernels, and a child can call them."""
+    program = textwrap.dedent(
+        """
+        import atexit, os, threading, time
+        from tofuse.engine.compute import ahead
+        begun, lock, loaded = threading.Event(), threading.Lock(), []
+        def slow(kernels):
+            with lock:
+                begun.set()
+                time.sleep(0.2)
+                loaded.extend(kernels)
+        atexit.register(lambda: print(0 < len(loaded) < len(ahead.signatures())))
+        ahead.compile_all, ahead.usable_cores = slow, lambda: 2
+        ahead._are_compiled = lambda: True
+        ahead.load_in_background()
+        begun.wait()
+        child = os.fork()
+        if not child:
+            os._exit(0 if lock.acquire(timeout=5) else 1)
+        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+        """
+    )
+    words = [sys.executable, "-W", "ignore", "-c", program]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout == "0\nTrue\n", done.stderr

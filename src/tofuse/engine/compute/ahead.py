@@ -14,8 +14,10 @@ import os
 import re
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,7 @@ import numba
 from llvmlite.binding import get_host_cpu_name
 
 from tofuse.engine.compute import jit, kernel_cache
-from tofuse.engine.compute.thread_pool import usable_cores
+from tofuse.engine.compute.thread_pool import ProcessLock, job_pool, usable_cores
 
 # Helper processes, each of which takes about 0.5 GB of memory; at most half of the cores.
 _MAX_HELPERS = 3
@@ -65,6 +67,37 @@ def compiling_in_background() -> Iterator[bool]:
             stack.callback(helper.wait)
             stack.callback(helper.terminate)
         yield True
+
+
+@cache  # once per process
+def load_in_background() -> None:
+    """Load the listed kernels on another thread if they are compiled, so that no call waits for it.
+
+    In the order of their first use, one after the other: the process may end, or fork, in between.
+    """
+    if usable_cores() == 1 or not _are_compiled():
+        return
+    pool, kernels, loading = job_pool(1, "tofuse-kernels"), iter(signatures()), ProcessLock()
+    forked = threading.Event()
+
+    def load() -> None:
+        with loading:
+            kernel = None if forked.is_set() else next(kernels, None)
+            if kernel is None:
+                pool.shutdown(wait=False)
+                return
+            compile_all([kernel])
+        with suppress(RuntimeError):  # as the process ends
+            pool.submit(load)
+
+    def finish() -> None:
+        forked.set()
+        with loading:
+            pass
+
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(before=finish)  # Numba's lock must be free in the child
+    pool.submit(load)
 
 
 @contextmanager
