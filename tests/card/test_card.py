@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +138,14 @@ def test_mixture_of_cameras_is_refused(
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_two_results_of_the_same_frames_are_refused(tmp_path: Path) -> None:
+    first, second = campaign(tmp_path, count=2)
+    again = first.parent / "again"
+    shutil.copytree(first, again)
+    with pytest.raises(InputError, match="is of the same recording as"):
+        make_card([first, second, again])
 
 
 def test_results_without_estimates(tmp_path: Path) -> None:

@@ -80,9 +80,10 @@ def collected(results: Sequence[Path]) -> tuple[Identity, list[Session]]:
     ------
     InputError
         If a folder is no result of one recording of images, its recording is missing or has
-        changed, or they are of different cameras.
+        changed, two are of the same frames, or they are of different cameras.
     """
     identities, sessions = zip(*(_read(folder) for folder in results), strict=True)
+    reopening.check_different(results)
     first = identities[0]
     for identity, folder in zip(identities, results, strict=True):
         if identity != first:

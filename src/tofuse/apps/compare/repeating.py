@@ -162,35 +162,15 @@ def loaded_sessions(paths: Sequence[Path], progress: Progress) -> list[Session]:
     if len(paths) < 2:
         raise InputError("is a single result", where="RESULT", remedy="pass two or more")
     sessions = []
-    seen: dict[tuple[object, ...], Path] = {}
     for path in paths:
         folders.check_result(path)
-        for frame in _recorded_frames(path):
-            if (other := seen.setdefault(frame, path)) is not path:
-                raise InputError(
-                    f"is of the same recording as {other}: its noise is the same, not repeated",
-                    where=path,
-                    remedy="pass results of different recordings",
-                )
+    reopening.check_different(paths)
+    for path in paths:
         result = load_result(path)
         surface = surface_of(result, str(path))
         sessions.append(Session(str(path), path.resolve().parent.name, result, surface))
         progress.advance()
     return sessions
-
-
-def _recorded_frames(folder: Path) -> list[tuple[object, ...]]:
-    """Return what identifies the frames of a result, as far as their recordings are known."""
-    with run_json.opened(folder) as run:
-        try:
-            parts = list(reopening.stored_recordings(folder, run))
-        except InputError:
-            return []
-    return [
-        (*(path.resolve() for path in part.opening.paths), part.opening.average_still, index)
-        for part in parts
-        for index in part.frames
-    ]
 
 
 def repeated(sessions: Sequence[Session], *, searched: bool = True) -> Repetition:

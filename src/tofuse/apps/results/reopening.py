@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
+from tofuse.apps.results import run_json
 from tofuse.apps.results.folders import RECORDING
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, Recording, Source
@@ -50,6 +51,30 @@ class StoredRecording:
     times: dict[int, float] | None
     depths: dict[int, float]
     frames: list[int]
+
+
+def check_different(folders: Sequence[Path]) -> None:
+    """Raise InputError if frames are in two results, whose errors are then the same.
+
+    Results that don't state their recordings are taken for different ones.
+    """
+    seen: dict[tuple[object, ...], Path] = {}
+    for folder in folders:
+        with run_json.opened(folder) as run:
+            try:
+                parts = list(stored_recordings(folder, run))
+            except InputError:
+                continue
+        for part in parts:
+            recorded = (*(path.resolve() for path in part.opening.paths), part.opening.average_still)
+            for index in part.frames:
+                other = seen.setdefault((*recorded, index), folder)
+                if other is not folder:
+                    raise InputError(
+                        f"is of the same recording as {other}: its errors are the same",
+                        where=folder,
+                        remedy="pass results of different recordings",
+                    )
 
 
 def stored_recordings(folder: Path, run: Mapping[str, Any]) -> Iterator[StoredRecording]:
