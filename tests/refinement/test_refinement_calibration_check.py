@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from aligned_surfaces import OPTIONS, SHARP, path, surfaces
-from corner_views import CAMERA, corner
+from corner_views import BARREL, CAMERA, corner
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.refinement.calibration_check import (
@@ -89,6 +89,32 @@ def test_correct_camera_raises_no_alarm():
     assert found.gap is None
     # What the views estimate still counts: less than the uncertainty of the estimate.
     assert 0 < found.moved[0] < 3 * found.focal_sigma * found.motion["focal"][0]
+
+
+def test_few_views_determine_nothing_and_say_what_it_would_do():
+    views, refined = kept(0.0, views=5)
+    found = check_calibration(views, refined, OPTIONS, Priors.none())
+    assert found.undetermined
+    assert not found.estimates
+    assert not found.alarm
+    assert found.motion["focal"][0] > 0
+
+
+def test_significant_error_counts_however_large_its_sigma():
+    """A distortion that was left out, of views that determine it less well than usual cameras."""
+    truth = path(12)
+    rng = np.random.default_rng(0)
+    views = []
+    for k, T in enumerate(truth):
+        frame = corner(T, camera=BARREL)
+        depth = frame.depth + rng.normal(0, 0.003, frame.depth.shape)
+        frame = replace(frame, index=k, camera=CAMERA, depth=depth.astype(np.float32))
+        views.append(SampledView.of(prepare_view(frame, SHARP), 1500))
+    found = check_calibration(views, refine(views, truth, OPTIONS), OPTIONS, Priors.none())
+    error, sigma = found.estimates["distortion"]
+    assert not found.determines("distortion")
+    assert error > found.significance * sigma
+    assert found.moved[0] >= 0.99 * error * found.motion["distortion"][0]
 
 
 def test_focal_length_without_rotation_is_undetermined():

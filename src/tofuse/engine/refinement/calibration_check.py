@@ -63,7 +63,7 @@ _SUPPORT_NOISE = 0.003
 # which the search also begins; and the fraction of it that the views must confirm, as they may
 # measure another one.
 _LOOP_FACTOR, _MIN_CONFIRMED = 2.0, 0.5
-# Minimum number of views from which their spread is estimated.
+# Minimum number of views from which their spread is estimated; of fewer, no error is known.
 _MIN_VIEWS = 8
 _DELTA = 1e-3  # error of the camera for numerical differentiation
 _INDEX = {
@@ -108,7 +108,7 @@ class CalibrationCheck:
         Rms motion (m, rad) of the poses, after alignment, that a unit of each error causes.
     moved
         Largest rms motion (m, rad) of the poses, after alignment, if one of the likely errors is
-        corrected, or by the first estimate of one that the views determine.
+        corrected, or by the first estimate of one that the views determine or that is significant.
     changed, change_confirmed
         Rms motion (m, rad) of the poses by a change of the range, if that is significant, and
         whether it can't be multipath, see `RangeChange`.
@@ -140,7 +140,8 @@ class CalibrationCheck:
     @property
     def undetermined(self) -> bool:
         """Whether a wrong focal length would not show in this recording."""
-        return self.focal_sigma is not None and not _determined("focal", self.focal_sigma)
+        sigma = np.inf if self.focal_sigma is None else self.focal_sigma
+        return bool(self.motion) and not _determined("focal", sigma)
 
     def determines(self, name: str) -> bool:
         """Whether the views determine an error of the camera."""
@@ -200,15 +201,17 @@ def check_calibration(
     views, refined, options, priors
         Of the joint alignment without errors of the camera, see `refine`.
     """
-    if not len(refined.pairs) or len(views) < _MIN_VIEWS:
+    if not len(refined.pairs):
         return CalibrationCheck()
     first = _FirstEstimates.of(views, refined, options, priors)
     significance = significance_of(len(views))
+    if len(views) < _MIN_VIEWS:
+        return CalibrationCheck(motion=first.motion, significance=significance)
     without_error = CalibrationCheck(
         focal_sigma=first.sigmas["focal"],
         estimates={name: (first.errors[name], first.sigmas[name]) for name in _INDEX},
         motion=first.motion,
-        moved=first.largest_motion,
+        moved=first.largest_motion(significance),
         significance=significance,
     )
     if first.change is not None:
@@ -268,7 +271,7 @@ def check_calibration(
         support=(support, with_best),
         gap=gap,
         best=best_name,
-        moved=max(largest, first.largest_motion),
+        moved=max(largest, first.largest_motion(significance)),
         contradicted=contradicted,
     )
 
@@ -310,7 +313,7 @@ class _FirstEstimates:
         poses, pairs = refined.poses, refined.pairs
         linearised = Linearised.of(views, poses, pairs, options, priors)
         sensitivity = linearised.response_to_errors()
-        change = likely_change(linearised, views, pairs)
+        change = likely_change(linearised, views, pairs) if len(views) >= _MIN_VIEWS else None
         change_motion = 0.0, 0.0
         if change is not None and change.is_significant:
             change_motion = _motion(poses, change.scale * change.follow)
@@ -334,13 +337,16 @@ class _FirstEstimates:
         limit = max(_LIKELY * self.sigmas[name], _MIN_FIRST_STEP * TOLERANCES[name])
         return abs(self.errors[name]) > limit
 
-    @property
-    def largest_motion(self) -> tuple[float, float]:
-        """Largest rms motion (m, rad) of the poses by an error that the views determine."""
+    def largest_motion(self, significance: float) -> tuple[float, float]:
+        """Largest rms motion (m, rad) of the poses by an error that the views determine.
+
+        Or by one whose estimate exceeds a number of standard deviations, however large they are.
+        """
         motions = [
-            (m * abs(self.errors[name]), rad * abs(self.errors[name]))
+            (m * abs(error), rad * abs(error))
             for name, (m, rad) in self.motion.items()
-            if name in self.determined
+            if (error := self.errors[name])
+            and (name in self.determined or abs(error) > significance * self.sigmas[name])
         ]
         return max(motions, default=(0.0, 0.0))
 
