@@ -87,7 +87,15 @@ def test_options_override_those_of_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "words", ["--faces 0", "--faces x", "--voxel 0mm", "--voxel 3 miles", "--tolerance -1mm"]
+    "words",
+    [
+        "--faces 0",
+        "--faces x",
+        "--voxel 0mm",
+        "--voxel 3 miles",
+        "--tolerance -1mm",
+        "--tolerance 5",  # millimetres are meant
+    ],
 )
 def test_invalid_numbers_name_their_option(words: str, capfd) -> None:
     option, value = words.split(maxsplit=1)

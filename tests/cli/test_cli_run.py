@@ -229,6 +229,8 @@ def test_unreadable_frame_is_skipped_and_blank_one_lost(recording, tmp_path, cap
     np.testing.assert_allclose(times, recorded[[0, 2, 4, 5]], atol=1e-6)
     assert read_g2o(tmp_path / "out/pose_graph.g2o").ids.tolist() == [0, 2, 4, 5]
     assert "Frame 1 could not be read." in (tmp_path / "out/report.html").read_text()
+    (text,) = (r["text"] for r in data["reasons"] if r["code"] == "unreadable_frames")
+    assert "000001.png" in text
 
 
 def test_loops_are_read_from_file(room_recording, tmp_path) -> None:

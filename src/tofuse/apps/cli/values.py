@@ -54,10 +54,12 @@ def _depth(text: str) -> float:
 
 
 def _length(text: str) -> float:
-    """Read a positive length."""
+    """Read a positive length, of the size of errors and details: metres only if they are stated."""
     value = _depth(text)
     if value == 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a length, such as 30mm or 0.03")
+    if value >= 1 and text.strip()[-1] != "m":
+        raise argparse.ArgumentTypeError(f"{text!r} would be metres: write {text}mm or {text}m")
     return value
 
 

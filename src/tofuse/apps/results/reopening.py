@@ -66,7 +66,10 @@ def check_different(folders: Sequence[Path]) -> None:
             except InputError:
                 continue
         for part in parts:
-            recorded = (*(path.resolve() for path in part.opening.paths), part.opening.average_still)
+            recorded = (
+                *(path.resolve() for path in part.opening.paths),
+                part.opening.average_still,
+            )
             for index in part.frames:
                 other = seen.setdefault((*recorded, index), folder)
                 if other is not folder:

@@ -217,7 +217,10 @@ def _poses(e: Evidence) -> Iterator[Reason]:
         yield Reason("lost_frames", lost, text)
     skipped = ranges_with_status(e.records, "skipped")
     if skipped:
-        yield Reason("unreadable_frames", skipped, f"{_sentence(skipped)} could not be read.")
+        first = next(r for r in e.records if r.status == "skipped")
+        which = "" if frame_ranges.is_single(skipped) else f" Frame {first.index}:"
+        text = f"{_sentence(skipped)} could not be read.{which} {first.reason.rstrip('.')}."
+        yield Reason("unreadable_frames", skipped, text)
     if len(posed) == 1:
         frame = posed[0].index
         text = f"Only frame {frame} has a pose: nothing to register, accuracy not assessed."
