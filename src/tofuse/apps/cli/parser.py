@@ -137,9 +137,9 @@ def _function(cls: type[Command], name: str) -> Callable[[argparse.Namespace], i
         options = cls(**vars(arguments))
         if not cls.reconstructs:
             return function(options)
-        from tofuse.engine.compute import compiling_in_background
+        from tofuse.engine.compute import ahead
 
-        with compiling_in_background() as is_first_run:
+        with ahead.compiling_in_background() as is_first_run:
             if is_first_run and sys.stderr.isatty():
                 sys.stderr.write(
                     "tofuse: the first run compiles the numerical kernels, each when it is needed: "

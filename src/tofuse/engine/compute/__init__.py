@@ -1,7 +1,6 @@
 """Compiled kernels, threads and memory: what makes the engine fast and its results reproducible.
 
-`kernel` compiles a function over arrays; `compiling_in_background` does it ahead of the first call,
-and `load_in_background` loads what is compiled.
+`kernel` compiles a function over arrays; `ahead` compiles or loads kernels before they are called.
 `run_chunks` and `run_all` use one thread pool, and their results are the same for any number of
 `threads`; `one_blas_thread` does the same for BLAS. `Spill` keeps arrays within a budget of memory,
 the rest on disk. `median` and `tukey_kernels` are the statistics that several rooms share.
@@ -12,8 +11,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.compute import tukey_kernels
-    from tofuse.engine.compute.ahead import compiling_in_background, load_in_background
+    from tofuse.engine.compute import ahead, tukey_kernels
     from tofuse.engine.compute.jit import kernel
     from tofuse.engine.compute.partition import median
     from tofuse.engine.compute.spill import Scratch, Spill, trim_memory

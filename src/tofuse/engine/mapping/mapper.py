@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.compute import load_in_background, thread_count, threads, trim_memory
+from tofuse.engine.compute import ahead, thread_count, threads, trim_memory
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.geometry import se3
@@ -84,7 +84,7 @@ class Mapper:
         self.seed = seed
         self.threads = threads if threads is not None else thread_count()
         if self.threads > 1:
-            load_in_background()
+            ahead.load_in_background()
         self.watch = current()
         self._prior_loops, self._surface = _prior_loops(loops), surface
         if progress and not hasattr(progress, "began"):
