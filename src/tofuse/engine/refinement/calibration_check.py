@@ -342,11 +342,11 @@ class _FirstEstimates:
 
         Or by one whose estimate exceeds a number of standard deviations, however large they are.
         """
+        sizes = {name: abs(error) for name, error in self.errors.items()}
         motions = [
-            (m * abs(error), rad * abs(error))
+            (sizes[name] * m, sizes[name] * rad)
             for name, (m, rad) in self.motion.items()
-            if (error := self.errors[name])
-            and (name in self.determined or abs(error) > significance * self.sigmas[name])
+            if name in self.determined or sizes[name] > significance * self.sigmas[name]
         ]
         return max(motions, default=(0.0, 0.0))
 
