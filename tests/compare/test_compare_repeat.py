@@ -13,6 +13,7 @@ from tofuse.apps.compare.nearest import Reference
 from tofuse.apps.compare.repeating import Session, components, loaded_sessions, repeated
 from tofuse.engine.errors import InputError
 from tofuse.engine.progress import Silent
+from written_run_json import change_run
 
 
 def test_components_are_those_of_the_model() -> None:
@@ -69,6 +70,14 @@ def test_results_of_the_same_frames_are_refused(room_result, tmp_path) -> None:
     again = shutil.copytree(room_result, tmp_path / "again")
     with pytest.raises(InputError, match="same recording"):
         loaded_sessions([room_result, again], Silent())
+
+
+def test_arrays_in_memory_are_not_one_recording(room_result, tmp_path) -> None:
+    folders = [shutil.copytree(room_result, tmp_path / name) for name in "ab"]
+    for folder in folders:
+        facts = {"path": "arrays", "format": "arrays", "frames": 3, "opening": None}
+        change_run(folder, input=facts)
+    assert len(loaded_sessions(folders, Silent())) == 2
 
 
 def test_a_single_result_is_refused(tmp_path) -> None:

@@ -191,13 +191,8 @@ def with_given_poses(config: Config) -> Config:
 
 def _check_different(first: Session, second: Session) -> None:
     """Raise InputError if frames of one recording are in both sessions."""
-
-    def facts(session: Session) -> tuple[object, ...]:
-        o = session.opening
-        return tuple(path.resolve() for path in o.paths), o.average_still
-
     common = first.posed.keys() & second.posed.keys()
-    if facts(first) == facts(second) and common:
+    if first.opening.source == second.opening.source and common:
         raise InputError(
             f"is of the same recording as {first.result}: {len(common)} frames are in both",
             where=second.result,

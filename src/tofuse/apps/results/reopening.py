@@ -58,7 +58,7 @@ def check_different(folders: Sequence[Path]) -> None:
 
     Results that don't state their recordings are taken for different ones.
     """
-    seen: dict[tuple[object, ...], Path] = {}
+    seen: dict[tuple[object, int], Path] = {}
     for folder in folders:
         with run_json.opened(folder) as run:
             try:
@@ -66,12 +66,9 @@ def check_different(folders: Sequence[Path]) -> None:
             except InputError:
                 continue
         for part in parts:
-            recorded = (
-                *(path.resolve() for path in part.opening.paths),
-                part.opening.average_still,
-            )
+            source = part.opening.source
             for index in part.frames:
-                other = seen.setdefault((*recorded, index), folder)
+                other = seen.setdefault((source, index), folder)
                 if other is not folder:
                     raise InputError(
                         f"is of the same recording as {other}: its errors are the same",
@@ -127,8 +124,8 @@ def stored_recordings(folder: Path, run: Mapping[str, Any]) -> Iterator[StoredRe
 
 def _opening_of_path(recording: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return how to open the recording of a result written from Python: only its path is stored."""
-    if recording["path"] is None:
-        problem = "has no recording: its frames were pushed one by one"
+    if recording["path"] is None or recording["format"] == "arrays":  # then it is no path
+        problem = "has no recording: its frames were pushed one by one, or arrays in memory"
         raise InputError(problem, where=folder, remedy="record them, and run `tofuse run`")
     return Opening((Path(recording["path"]),)).to_dict()
 

@@ -380,6 +380,11 @@ class Opening(OpeningOptions):
         names = [f.name for f in fields(cls) if hasattr(options, f.name)]
         return cls(tuple(map(Path, inputs)), **{name: getattr(options, name) for name in names})
 
+    @property
+    def source(self) -> tuple[object, ...]:
+        """What the frames are from: with their index, it identifies them."""
+        return (*(path.resolve() for path in self.paths), self.average_still)
+
     def open(self) -> Recording:
         """Open the recording; InputError if that fails."""
         recording = open_recording(
