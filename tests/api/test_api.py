@@ -151,6 +151,8 @@ def test_evaluate_accepts_files_and_arrays(result, arrays, tmp_path):
     assert within == (0.0, pytest.approx(by_array + 0.01))
     with pytest.raises(tofuse.InputError, match="shape"):
         tofuse.evaluate(result.trajectory[:, :3], poses)
+    with pytest.raises(tofuse.InputError, match=r"hold \d+ and \d+ poses"):
+        tofuse.evaluate(result.trajectory[:-1], poses)
     for wrong in (2 * poses, poses @ np.diag([-1, 1, 1, 1]), poses.transpose(0, 2, 1)):
         with pytest.raises(tofuse.InputError, match=r"estimate\[\d\]: "):
             tofuse.evaluate(wrong, poses)

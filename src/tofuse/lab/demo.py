@@ -15,7 +15,7 @@ from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.files import atomic, staging
-from tofuse.lab.simulation import Effects, Passing, phone, simulate
+from tofuse.lab.simulation import CAMERAS, Effects, Passing, check_camera, phone, simulate
 
 # Settings of the thesis per scene (section 4.1): points beyond the object are removed.
 _SCENE_OPTIONS: dict[str, dict[str, Any]] = {
@@ -163,6 +163,7 @@ def simulate_to(
     OutputError
         If the folder can't be written, or is not empty.
     """
+    check_camera(camera, [*CAMERAS, phone.NAME])
     progress = progress or Silent()
     completed = 0
 

@@ -157,12 +157,14 @@ def _run_live(arguments: cli.Run) -> int:
     """Run and show the reconstruction live; then show the result until Ctrl-C."""
     from tofuse.apps.jobs import exit_status
     from tofuse.apps.jobs import run as run_pipeline
+    from tofuse.apps.results import folders
     from tofuse.apps.viewer import LiveView, address, serve, stop
     from tofuse.engine.progress import CombinedProgress
 
     if arguments.profile:
         raise InputError("can't be used with --view", where="--profile", remedy="leave one out")
     options = run_options(arguments)
+    folders.check_output(arguments.out, overwrite=arguments.overwrite)  # before a browser opens
     server = serve(arguments.port)
     try:
         _show(address(server), arguments)

@@ -115,6 +115,13 @@ def evaluate(
             where=by_frame[0],
             remedy="pass the recording, which has the times, with --recording",
         )
+    arrays = [isinstance(source, np.ndarray) for source in (estimate, reference)]
+    if all(arrays) and len(timed[0].poses) != len(timed[1].poses):
+        raise InputError(
+            f"hold {len(timed[0].poses)} and {len(timed[1].poses)} poses",
+            where=", ".join(names),
+            remedy="pass poses of the same frames, NaN where there is none",
+        )
     times, poses = _timed(timed[0], estimate, clock, names[0])
     reference_times, reference_poses = _timed(timed[1], reference, clock, names[1])
     # About the clouds: errors of rotation have long lever arms at the origin of map coordinates.

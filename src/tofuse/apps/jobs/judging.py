@@ -545,7 +545,7 @@ def sentence(judgement: Judgement, name: str) -> str:
     cause = "" if judgement.cause is None else f" The cause is probably {judgement.cause.text}."
     return (
         f"{name}{_scale(judgement.scale)}: {given_bound}, poses of {posed.sum()} of {len(posed)} "
-        f"frames; {label}: {refined_bound}.{_agreement(judgement.deviation)}{cause}"
+        f"frames; {label}: {refined_bound}.{_agreement(judgement)}{cause}"
     )
 
 
@@ -556,16 +556,16 @@ def _scale(scale: pose_scale.PoseScale | None) -> str:
     return f" times {scale.factor:.4g} \N{PLUS-MINUS SIGN} {scale.sigma:.1g} m (scale by depth)"
 
 
-def _agreement(deviation: pose_deviation.Deviation | None) -> str:
+def _agreement(judgement: Judgement) -> str:
     """State whether the depth contradicts the poses."""
+    deviation = judgement.deviation
     if deviation is None:
         return ""
     if not deviation.consistent:
         about, at_least = map(_length, (deviation.estimate_m, deviation.at_least_m))
-        return (
-            " Inconsistent with the depth: surfaces displaced by about "
-            f"{about}, at least {at_least} (95 %)."
-        )
+        beyond = any(r.code == "inconsistent_poses" for r in judgement.reasons)
+        label = "Inconsistent with the depth" if beyond else "Errors within the tolerance"
+        return f" {label}: surfaces displaced by about {about}, at least {at_least} (95 %)."
     if not np.isfinite(deviation.at_most_m):
         return " Consistent with the depth, as far as that constrains them."
     return f" Consistent with the depth to within {_length(deviation.at_most_m)} (95 %)."

@@ -17,7 +17,7 @@ from tofuse.apps.report import (
 )
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.html import script, write_page
-from tofuse.apps.report.subject import OUTER_ENDS, Subject, Values
+from tofuse.apps.report.subject import INNER_ENDS, OUTER_ENDS, Subject, Values
 from tofuse.engine.compute import job_pool
 from tofuse.engine.results import Reconstruction, accuracy_card
 
@@ -116,14 +116,18 @@ def _plain(s: Subject) -> str:
     """Return size and accuracy in one sentence for everybody."""
     if not len(s.scene.points):
         return "There is no model."
-    sizes = np.ptp(np.percentile(s.scene.points @ s.R_display_world.T, OUTER_ENDS, axis=0), axis=0)
-    width, height, depth = map(words.length, sizes.tolist())
+    points = s.scene.points @ s.R_display_world.T
+    sizes, inner = (
+        np.ptp(np.percentile(points, ends, axis=0), axis=0) for ends in (OUTER_ENDS, INNER_ENDS)
+    )
+    # Where sparse points, such as wrong ones, lie beyond the bulk, the size is not sharp.
+    width, height, depth = map(words.rounded_length, sizes.tolist(), (sizes - inner).tolist())
     accuracy = s.result.diagnostics.accuracy
     if accuracy.assessed and np.isfinite(accuracy.position_m):
-        known = f"accurate to about {words.length(accuracy.position_m)}"
+        known = f"and its parts fit together to about {words.length(accuracy.position_m)}"
     else:
-        known = "but how accurate it is could not be determined"
-    return f"It is {width} wide, {height} high and {depth} deep, {known}."
+        known = "but how well its parts fit together could not be determined"
+    return f"It is about {width} wide, {height} high and {depth} deep, {known}."
 
 
 def _settings(s: Subject) -> Values:

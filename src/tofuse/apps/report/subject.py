@@ -17,6 +17,7 @@ Values = dict[str, Any]
 
 OUTER = 0.25  # percent of the points at each end that the measured size excludes
 OUTER_ENDS = (OUTER, 100 - OUTER)
+INNER_ENDS = (4 * OUTER, 100 - 4 * OUTER)  # those of the bulk
 ROWS = 150  # maximum in a table
 _ANGLES = np.arange(-44.5, 45.5, 0.5)[:, None]  # degrees
 _MIN_BOX_FILL = 0.9  # minimum fraction of a box in the hull of points that have its shape

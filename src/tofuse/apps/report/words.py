@@ -26,6 +26,13 @@ def length(metres: float | None) -> str:
     return f"{metres:.2f} m"
 
 
+def rounded_length(metres: float, spread: float) -> str:
+    """Return a length as text, without the digits of a metre that a `spread` leaves open."""
+    if metres < 0.1 or not spread > 0:
+        return length(metres)
+    return f"{metres:.{min(max(round(-np.log10(spread)), 0), 2)}f} m"
+
+
 def signed_length(metres: float) -> str:
     """Return a difference of lengths as text, with its sign."""
     return ("+" if metres >= 0 else "−") + length(abs(metres))

@@ -8,6 +8,7 @@ scaled to that stated by their makers.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, Self
@@ -286,11 +287,17 @@ def camera_model(name: str) -> CameraModel:
     InputError
         If there is none.
     """
-    if name not in CAMERAS:
-        raise InputError(
-            f"there is no camera called {name!r}", where="camera", remedy=f"use one of {[*CAMERAS]}"
-        )
+    check_camera(name, [*CAMERAS])
     return CAMERAS[name]
+
+
+def check_camera(name: str, names: Sequence[str]) -> None:
+    """Raise InputError unless there is a camera called `name`."""
+    if name not in names:
+        choices = ", ".join(names)
+        raise InputError(
+            f"there is no camera called {name!r}", where="camera", remedy=f"use one of {choices}"
+        )
 
 
 def noise_of(model: CameraModel) -> NoiseModel:
