@@ -75,8 +75,10 @@ def aligned_poses(points: Float32, poses: Float64, shown: Sequence[Shown]) -> Fl
     )
     tested = np.arange(len(chosen)) % 4 == 3
     xi = np.zeros((len(views), 6))
+    signals: list[Float32] = []
     for blur in _BLURS:
-        signals = run_all([partial(view.signal, blur) for view in views])
+        signals.clear()  # before there are others: they take 2 MB a view
+        signals += run_all([partial(view.signal, blur) for view in views])
         for _ in range(_ITERATIONS):
             for k, (row, error, slope) in enumerate(_differences(views, signals, xi, ~tested)):
                 if len(row) >= _MIN_POINTS:
