@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.compute import kernel
+from tofuse.engine.compute import inlined, kernel
 
 MIN_DEPTH = 0.02  # m; points nearer to a camera are not projected
 # Smallest slope of a lens's distortion, and Newton iterations that invert it.
@@ -146,19 +146,26 @@ def bend(r2: np.float32, lens: Float32) -> np.float32:
     return slope / max(factor + slope * r2, np.float32(MIN_SLOPE))
 
 
-@kernel
+@inlined
 def undistorted(
     x: np.float32, y: np.float32, near_x: np.float32, near_y: np.float32, lens: Float32
 ) -> tuple[np.float32, np.float32]:
     """Return the ray of the distorted one (x, y), by Newton's method from a ray near it."""
-    for _ in range(_ITERATIONS):
-        r2 = near_x * near_x + near_y * near_y
-        factor, b = distortion(r2, lens), bend(r2, lens)
-        dx, dy = x - near_x * factor, y - near_y * factor
-        along = b * (near_x * dx + near_y * dy)
-        near_x += (dx - along * near_x) / factor
-        near_y += (dy - along * near_y) / factor
-    return near_x, near_y
+    near_x, near_y = _nearer(x, y, near_x, near_y, lens)
+    near_x, near_y = _nearer(x, y, near_x, near_y, lens)
+    return _nearer(x, y, near_x, near_y, lens)
+
+
+@kernel
+def _nearer(
+    x: np.float32, y: np.float32, near_x: np.float32, near_y: np.float32, lens: Float32
+) -> tuple[np.float32, np.float32]:
+    """One iteration."""
+    r2 = near_x * near_x + near_y * near_y
+    factor, b = distortion(r2, lens), bend(r2, lens)
+    dx, dy = x - near_x * factor, y - near_y * factor
+    along = b * (near_x * dx + near_y * dy)
+    return near_x + (dx - along * near_x) / factor, near_y + (dy - along * near_y) / factor
 
 
 @kernel

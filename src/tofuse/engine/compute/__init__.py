@@ -12,7 +12,7 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.engine.compute import ahead, tukey_kernels
-    from tofuse.engine.compute.jit import kernel
+    from tofuse.engine.compute.jit import inlined, kernel
     from tofuse.engine.compute.partition import median
     from tofuse.engine.compute.spill import Scratch, Spill, trim_memory
     from tofuse.engine.compute.thread_pool import (

@@ -60,9 +60,18 @@ def shipped_kernels() -> tuple[Path, kernel_cache.Processor] | None:
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function over arrays: nogil, cached, with reproducible IEEE arithmetic."""
+    return _compiled(function)
+
+
+def inlined(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile a kernel into the loops of its callers: those with calls are not vectorised."""
+    return _compiled(function, forceinline=True)
+
+
+def _compiled(function: Callable[P, R], **options: bool) -> Callable[P, R]:
     njit: Any = numba.njit  # its type hints lack an option
     # Kernels are not called from C, and the wrapper for it takes time to compile.
-    compiled = njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)(function)
+    compiled = njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, **options)(function)
     compiled._cache = kernel_cache.KernelCache(function, cache_folder, shipped_kernels())
     result: Callable[P, R] = compiled
     return result
