@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import made_phones as made
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.formats.recordings.archives import unzipped
 from tofuse.formats.recordings.open import open_recording, open_view
 
@@ -52,6 +52,24 @@ def test_archive_of_single_file_is_that_file(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
         archive.write(tmp_path / "scan.r3d", "scan.r3d")
     assert open_recording(tmp_path / "a.zip").format == "record3d"
+
+
+def test_messages_name_the_archive(tmp_path: Path) -> None:
+    folder = tmp_path / "scan"
+    made.make_scanner_app(folder)
+    (folder / "depth_00001.png").write_bytes(b"")
+    with pytest.raises(UnreadableFrameError) as error:
+        open_recording(zipped(folder, tmp_path / "frame.zip", "scan 1"))[1]
+    assert error.value.where == str(tmp_path / "frame.zip" / "scan 1" / "depth_00001.png")
+    for file in folder.glob("frame_*.json"):
+        file.write_text("{}")
+    with pytest.raises(InputError, match="time") as refused:
+        open_recording(zipped(folder, tmp_path / "lens.zip"))
+    assert str(refused.value).startswith(f"{tmp_path / 'lens.zip' / 'frame_00000.json'}: time")
+    made.make_stray(tmp_path / "stray")
+    (tmp_path / "stray" / "imu.csv").write_text("timestamp\n1\n")
+    warnings = open_recording(zipped(tmp_path / "stray", tmp_path / "imu.zip")).warnings
+    assert any(line.startswith(f"{tmp_path / 'imu.zip' / 'imu.csv'}: ") for line in warnings)
 
 
 def test_unpacked_files_are_removed_with_the_process(tmp_path: Path) -> None:

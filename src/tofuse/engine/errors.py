@@ -8,6 +8,17 @@ from pathlib import Path
 _MAX_LENGTH = 600  # maximum characters of a problem: text quoted from a file may have any length
 
 
+# Temporary folders, and what messages name in their place: the archive that was unpacked there.
+SHOWN_AS: dict[str, str] = {}
+
+
+def shown(text: str) -> str:
+    """Return a message for the user, without the names of temporary folders."""
+    for folder, path in SHOWN_AS.items():
+        text = text.replace(folder, path)
+    return text
+
+
 def _clipped(text: str) -> str:
     return text if len(text) <= _MAX_LENGTH else f"{text[:_MAX_LENGTH]} ..."
 
@@ -18,11 +29,11 @@ class TofuseError(Exception):
     def __init__(
         self, problem: str, *, where: str | Path | None = None, remedy: str | None = None
     ) -> None:
-        self.problem = _clipped(problem)
-        self.where = None if where is None else str(where)
-        self.remedy = remedy
+        self.problem = _clipped(shown(problem))
+        self.where = None if where is None else shown(str(where))
+        self.remedy = None if remedy is None else shown(remedy)
         parts = [f"{_clipped(self.where)}: " if self.where else "", self.problem]
-        parts += [f"; {_clipped(remedy)}"] if remedy else []
+        parts += [f"; {_clipped(self.remedy)}"] if self.remedy else []
         super().__init__(" ".join("".join(parts).split()))
 
 

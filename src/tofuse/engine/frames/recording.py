@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.compute import job_pool
-from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.errors import InputError, UnreadableFrameError, shown
 from tofuse.engine.frames.frames import Frame, RangeFrame
 
 R = TypeVar("R")
@@ -170,7 +170,7 @@ class Recording:
     @property
     def warnings(self) -> list[str]:
         """Notes for the user on how the recording was read, one line each."""
-        return self.source.warnings
+        return [shown(warning) for warning in self.source.warnings]
 
     @property
     def metadata(self) -> dict[str, Any]:

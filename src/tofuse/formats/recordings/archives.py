@@ -9,7 +9,7 @@ import tempfile
 import zipfile
 from pathlib import Path, PurePosixPath
 
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import SHOWN_AS, InputError
 from tofuse.formats.files import reading
 
 _REMEDY = "unpack it yourself, and pass the folder"
@@ -47,7 +47,7 @@ def unzipped(path: str | Path) -> Path:
 
 
 def _unpack(path: Path) -> Path:
-    """Unpack an archive into a new folder, named like it for messages about its files."""
+    """Unpack an archive into a new folder, for which messages name the archive."""
     with reading.library_errors(path), zipfile.ZipFile(path) as archive:
         members = _checked(archive.infolist(), path)
         folder = Path(tempfile.mkdtemp(prefix="tofuse-"))
@@ -59,6 +59,7 @@ def _unpack(path: Path) -> Path:
                 where=path,
                 remedy=_REMEDY,
             )
+        SHOWN_AS[str(folder / path.name)] = str(path)
         for member in members:
             archive.extract(member, folder / path.name)
     return folder / path.name
