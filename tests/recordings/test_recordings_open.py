@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from made_phones import make_scanner_app
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
@@ -50,6 +51,26 @@ def test_folder_of_recordings_is_joined_in_name_order(tmp_path: Path) -> None:
     assert depths(open_recording(tmp_path)) == [1, 2, 3]
     assert depths(open_recording(tmp_path, format="native")) == [1, 2, 3]
     assert depths(open_recording(tmp_path).select(1)) == [2, 3]
+
+
+def test_folder_with_single_recording_stands_for_it(tmp_path: Path) -> None:
+    """An app's folder in one of the user, with notes beside it."""
+    make_scanner_app(tmp_path / "Küche 1" / "2026_11_28")
+    (tmp_path / "Küche 1" / "notes.txt").write_text("")
+    recording = open_recording(tmp_path / "Küche 1")
+    assert (recording.format, len(recording)) == ("3dscannerapp", 3)
+    make_scanner_app(tmp_path / "Küche 1" / "2026_11_29")
+    with pytest.raises(InputError, match="several recordings: 2026_11_28"):
+        open_recording(tmp_path / "Küche 1")
+    write(tmp_path / "native" / "part1", [1])
+    (tmp_path / "native" / "part1" / "noise.json").write_text("{}")
+    with pytest.raises(InputError, match=r"noise\.json"):
+        open_recording(tmp_path / "native")
+    # Clouds in a folder may as well be a model beside images of an unknown format.
+    (tmp_path / "unknown" / "mesh").mkdir(parents=True)
+    write_ply(tmp_path / "unknown" / "mesh" / "0.ply", GeometryRecord(np.ones((3, 3))))
+    with pytest.raises(InputError, match=r"contains only mesh \(ply\)"):
+        open_recording(tmp_path / "unknown")
 
 
 def test_recordings_of_different_formats_are_not_joined_by_default(tmp_path: Path) -> None:

@@ -62,7 +62,8 @@ def open_recording(
     paths
         Files, folders or .zip files of these; several are joined in the order given. A folder of
         native or SR4000 recordings is joined in name order; if it contains a rig.json, its
-        recordings are the cameras of a rig, one image of each in turn.
+        recordings are the cameras of a rig, one image of each in turn. A folder with a single
+        recording in one of its folders stands for it.
     format
         Name of a reader, instead of detection.
     camera
@@ -101,7 +102,7 @@ def open_recording(
     if len(sources) > 1:
         source = JoinedSource(sources, _short_names([item.path for item in located]))
     _check_usable(source, paths[0])
-    noise_file = inner[0] / "noise.json"
+    noise_file = (located[0].path if len(located) == 1 else inner[0]) / "noise.json"
     if len(paths) == 1 and reading.is_folder(noise_file.parent) and reading.is_file(noise_file):
         source.metadata[NOISE_MODEL] = read_noise(noise_file)
     if min_depth is not None or max_depth is not None:
@@ -230,19 +231,24 @@ def is_recording(path: Path) -> bool:
 
 
 def _recordings_in(path: Path) -> list[_Located]:
-    """The recordings in a folder, if any; InputError if they can't be joined."""
+    """The recordings in a folder, if any; InputError if there are several that can't be joined."""
     format_of: dict[Path, str] = {}
+    best = 0.0
     for folder in _folders_in(path):
         sniffs = _sniff(folder)
         confident = [name for name, s in sniffs.items() if s.confidence >= Sniff.CERTAIN]
         if confident:
             format_of[folder] = max(confident, key=lambda name: sniffs[name].confidence)
+            best = max(best, sniffs[format_of[folder]].confidence)
     if not format_of:
         return []
     formats = sorted(set(format_of.values()))
     listed = ", ".join(f"{p.name} ({name})" for p, name in list(format_of.items())[:6])
     reader = readers()[formats[0]]
-    if len(formats) > 1 or not reader.joinable:
+    if len(format_of) == 1 and not reader.joinable and best < 1:
+        # A model, say, among folders of an unknown format.
+        raise InputError(f"contains only {listed}", where=path, remedy="pass that, if you mean it")
+    if len(format_of) > 1 and (len(formats) > 1 or not reader.joinable):
         raise InputError(
             f"contains several recordings: {listed}",
             where=path,
