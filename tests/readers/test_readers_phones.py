@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+import zipfile
 from pathlib import Path
 
 import cv2
@@ -60,6 +62,14 @@ def test_stray(tmp_path: Path) -> None:
     assert not np.isfinite(recording.gravity).any()
 
 
+def test_stray_of_early_version(tmp_path: Path) -> None:
+    made.make_stray(tmp_path / "scan")
+    for k, path in enumerate(sorted((tmp_path / "scan" / "depth").iterdir())):
+        path.unlink()
+        np.save(path.with_suffix(".npy"), made.millimetres(made.DEPTH[k]))
+    check_frames(open_recording(tmp_path / "scan"))
+
+
 def test_stray_with_video_and_lens_of_each_frame(tmp_path: Path) -> None:
     made.make_stray(tmp_path / "scan", lenses=True)
     size = (320, 240)
@@ -104,6 +114,47 @@ def test_r3d_archive(tmp_path: Path) -> None:
     (tmp_path / "scan.r3d").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match="damaged archive"):
         open_recording(tmp_path / "scan.r3d")
+
+
+def test_unpacked_r3d_archive(tmp_path: Path) -> None:
+    """Also renamed to .zip, as users do to look inside, and alone in a folder."""
+    made.make_r3d(tmp_path / "one" / "scan.r3d")
+    with zipfile.ZipFile(tmp_path / "one" / "scan.r3d") as archive:
+        archive.extractall(tmp_path / "scan")
+    shutil.copy(tmp_path / "one" / "scan.r3d", tmp_path / "scan.zip")
+    for name in ("scan", "scan.zip", "one"):
+        recording = open_recording(tmp_path / name)
+        assert recording.format == "record3d"
+        check_frames(recording, turned=True, exact=0)
+
+
+@pytest.mark.parametrize("size", [(192, 256), (480, 640)], ids=["LiDAR", "TrueDepth"])
+def test_r3d_of_old_version(tmp_path: Path, size: tuple[int, int]) -> None:
+    """Without the size of depth, times and poses."""
+    depth = np.full(size[::-1], 1.5, "<f4")
+    facts = {"w": 480, "h": 640, "K": [580.0, 0, 0, 0, 580.0, 0, 239.5, 319.5, 1], "fps": 30}
+    with zipfile.ZipFile(tmp_path / "a.r3d", "w") as archive:
+        archive.writestr("metadata", json.dumps(facts | {"poses": []}))
+        archive.writestr("rgbd/0.depth", b"damaged")
+        archive.writestr("rgbd/1.depth", made.lzfse_raw(depth.tobytes()))
+    recording = open_recording(tmp_path / "a.r3d")
+    assert recording.reference is None
+    frame = recording[1]
+    np.testing.assert_array_equal(frame.depth, depth)
+    assert frame.camera == Pinhole(
+        *size, *[580 * size[0] / 480] * 2, size[0] / 2 - 0.5, size[1] / 2 - 0.5
+    )
+
+
+def test_record3d_lens_of_each_frame(tmp_path: Path) -> None:
+    """Autofocus moves the lens."""
+    made.make_record3d(tmp_path / "scan")
+    facts = made.record3d_metadata()
+    facts["perFrameIntrinsicCoeffs"] = [[made.FX + 10 * k, made.FX, made.CY, 960] for k in range(2)]
+    (tmp_path / "scan" / "metadata.json").write_text(json.dumps(facts))
+    cameras = [frame.camera for frame in open_recording(tmp_path / "scan")]
+    assert [camera.fx * 60 for camera in cameras] == pytest.approx([made.FX, made.FX + 10, made.FX])
+    assert [(c.cy + 0.5) * 60 - 0.5 for c in cameras] == pytest.approx([960, 960, made.CX])
 
 
 @pytest.mark.nightly

@@ -21,6 +21,7 @@ from tofuse.formats.images import as_color, parse_exr, parse_image
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, phones, pixels
 
 MAX_MEMBER_BYTES = 1 << 26
+_SIZES = ((192, 256), (480, 640))  # of LiDAR and TrueDepth cameras; old archives don't state it
 _MEMBER = re.compile(r"rgbd/([0-9]{1,9})\.depth")
 _EXR = re.compile(r"([0-9]{1,9})\.exr", re.IGNORECASE)
 _REMEDY = "export the recording again"
@@ -35,14 +36,19 @@ class Record3D(Reader):
         if reading.is_folder(path):
             if reading.is_file(path / "metadata.json") and _numbered(path / "depth", _EXR):
                 return Sniff(1.0, "metadata.json and depth/*.exr")
-            return None
+            if reading.is_file(path / "metadata") and reading.is_folder(path / "rgbd"):
+                return Sniff(1.0, "metadata and rgbd/, an unpacked .r3d archive")
         matches = inputs.begins_with(inputs.file_of(path, ".r3d"), b"PK\x03\x04")
         return Sniff(1.0, "a .r3d archive") if matches else None
 
     def open(self, path: Path, options: ReaderOptions) -> Record3DSource:
         """See `Reader.open`."""
         inputs.refuse_camera(options, "record3d", inputs.PER_FRAME)
-        return Record3DSource(_Folder(path) if reading.is_folder(path) else _Archive(path))
+        if reading.is_file(path / "metadata"):
+            return Record3DSource(_UnpackedArchive(path))
+        if reading.is_file(path / "metadata.json"):
+            return Record3DSource(_Folder(path))
+        return Record3DSource(_Archive(inputs.required_file(path, ".r3d")))
 
 
 class Record3DSource(FileSource):
@@ -51,8 +57,7 @@ class Record3DSource(FileSource):
     def __init__(self, store: _Folder | _Archive) -> None:
         self.store = store
         metadata = _Metadata(store.metadata(), store.where)
-        self.size = metadata.depth_size(store.default_size)
-        self.camera = metadata.lens(self.size)
+        self.size = metadata.depth_size() or store.depth_size()
         times = metadata.times()
         numbers = np.array(store.numbers)
         # Poses and timestamps cover all frames; an export may contain a subset.
@@ -60,6 +65,7 @@ class Record3DSource(FileSource):
         if times is None or not has_times:
             times = np.arange(numbers.max() + 1) / metadata.frame_rate()
         super().__init__(times[numbers])
+        self.cameras = metadata.lenses(self.size, store.numbers)
         if not has_times:
             self.warnings.append(
                 f"{store.where}: no timestamps for all frames: assumed to be evenly spaced"
@@ -69,6 +75,8 @@ class Record3DSource(FileSource):
             inside = numbers < len(poses)
             self.reference = np.full((len(numbers), 4, 4), np.nan)
             self.reference[inside] = poses[numbers[inside]]
+            if not np.isfinite(self.reference).any():
+                self.reference = None
         self.metadata |= {"sensor": phones.SENSOR, "depth_kind": "z", POSES_BY: "ARKit"}
         if store.has_confidence:
             self.metadata["confidence_max"] = phones.CONFIDENCE_MAX
@@ -88,14 +96,19 @@ class Record3DSource(FileSource):
         if stored is not None:
             color = pixels.resized(as_color(parse_image(*stored)), self.size, stored[1])
         confidence = self.store.confidence(number, self.size)
-        return self.image(index, depth, confidence_image=confidence, color_image=color)
+        return self.image(
+            index,
+            depth,
+            camera=self.cameras[index],
+            confidence_image=confidence,
+            color_image=color,
+        )
 
 
 class _Folder:
     """The EXR + JPG export."""
 
     has_confidence = False
-    default_size: tuple[int, int] | None = None
 
     def __init__(self, path: Path) -> None:
         self.where = path / "metadata.json"
@@ -105,6 +118,9 @@ class _Folder:
 
     def metadata(self) -> dict[str, Any]:
         return reading.read_json(self.where)
+
+    def depth_size(self) -> tuple[int, int]:
+        raise InputError("is missing", where=f"{self.where}: dw", remedy=_REMEDY)
 
     def depth(self, number: int, size: tuple[int, int]) -> Float32:
         path = self.files[number]
@@ -126,26 +142,34 @@ class _Folder:
 class _Archive:
     """A .r3d file: a ZIP archive of `metadata` and, for each frame, rgbd/N.depth, .conf, .jpg."""
 
-    default_size = (192, 256)
-
     def __init__(self, path: Path) -> None:
         self.path = path
         self.where = Path(f"{path}: metadata")
         reading.required_package("lzfse", "phones", path)
+        self.names = self._open()
+        matches = (_MEMBER.fullmatch(name) for name in self.names)
+        self.numbers = sorted({int(m.group(1)) for m in matches if m})
+        if not self.numbers:
+            raise InputError("contains no rgbd/*.depth", where=path, remedy="export it again")
+        self.has_confidence = f"rgbd/{self.numbers[0]}.conf" in self.names
+
+    def _open(self) -> set[str]:
+        path = self.path
         try:
             self.archive = zipfile.ZipFile(path)
-            self.names = set(self.archive.namelist())
+            return set(self.archive.namelist())
         except OSError as error:
             raise reading.input_error(error, path) from error
         except (zipfile.BadZipFile, ValueError, NotImplementedError, RuntimeError) as error:
             raise InputError(
                 f"is a damaged archive ({error})", where=path, remedy="copy the file again"
             ) from error
-        matches = (_MEMBER.fullmatch(name) for name in self.names)
-        self.numbers = sorted({int(m.group(1)) for m in matches if m})
-        if not self.numbers:
-            raise InputError("contains no rgbd/*.depth", where=path, remedy="export it again")
-        self.has_confidence = f"rgbd/{self.numbers[0]}.conf" in self.names
+
+    def depth_size(self) -> tuple[int, int]:
+        """The size of depth for which the first readable frame has the right length."""
+        trials = [(number, size) for number in self.numbers for size in _SIZES]
+        nothing = InputError("is missing", where=f"{self.where}: dw", remedy=_REMEDY)
+        return reading.first_readable(trials, lambda t: self.depth(*t).shape[::-1], nothing)
 
     def metadata(self) -> dict[str, Any]:
         return reading.parse_json(self._member("metadata"), self.where, _REMEDY)
@@ -189,22 +213,42 @@ class _Archive:
         return data
 
 
+class _UnpackedArchive(_Archive):
+    """The same files in a folder."""
+
+    def _open(self) -> set[str]:
+        return {f"rgbd/{file.name}" for file in reading.list_folder(self.path / "rgbd")}
+
+    def _member(self, name: str) -> bytes:
+        return reading.read_bytes(self.path / name, limit=MAX_MEMBER_BYTES)
+
+
 class _Metadata:
     """Checked access to Record3D's metadata."""
 
     def __init__(self, data: dict[str, Any], where: Path) -> None:
         self.data, self.where = data, where
 
-    def depth_size(self, default: tuple[int, int] | None) -> tuple[int, int]:
-        """Return (width, height) of depth; `default` for older versions, which don't state it."""
-        if default is not None and not ("dw" in self.data and "dh" in self.data):
-            return default
+    def depth_size(self) -> tuple[int, int] | None:
+        """Return (width, height) of depth; None in older versions, which don't state it."""
+        if not ("dw" in self.data and "dh" in self.data):
+            return None
         return camera_file.image_size(self._number("dw"), self._number("dh"), f"{self.where}: dw")
 
-    def lens(self, size: tuple[int, int]) -> Pinhole:
+    def lenses(self, size: tuple[int, int], numbers: list[int]) -> list[Pinhole]:
+        """Return the lens of each frame; autofocus moves it, which older versions don't state."""
         K = reading.numbers_in(self.data, "K", self.where, (3, 3), _REMEDY).T
         full_size = camera_file.image_size(self._number("w"), self._number("h"), f"{self.where}: w")
-        return phones.phone_lens(K, full_size, size, f"{self.where}: K")
+        field, table = "perFrameIntrinsicCoeffs", np.zeros((0, 4))
+        if self.data.get(field):
+            table = reading.numbers_in(self.data, field, self.where, (-1, 4), _REMEDY, finite=False)
+        common = phones.phone_lens(K, full_size, size, f"{self.where}: K")
+        lenses = [common] * len(numbers)
+        for k, number in enumerate(numbers):
+            if number < len(table) and np.isfinite(table[number]).all():
+                K[[0, 1, 0, 1], [0, 1, 2, 2]] = table[number]
+                lenses[k] = phones.phone_lens(K, full_size, size, f"{self.where}: {field}")
+        return lenses
 
     def frame_rate(self) -> float:
         rate = self._number("fps", 60.0)

@@ -62,9 +62,10 @@ class StraySource(phones.PhoneSource):
     """
 
     def __init__(self, folder: Path) -> None:
-        files = inputs.required(
-            reading.files_with(folder / "depth", ".png"), ".png files", folder / "depth"
-        )
+        # Early versions of the app wrote arrays.
+        files = reading.files_with(folder / "depth", ".png")
+        files = files or reading.files_with(folder / "depth", ".npy")
+        inputs.required(files, ".png or .npy files", folder / "depth")
         confidence = {p.stem: p for p in _images(folder / "confidence")}
         super().__init__(
             files,
