@@ -26,6 +26,7 @@ from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry.se3 import exp
 from tofuse.engine.noise.model import family_of
 from tofuse.formats.geometry.ply import write_ply
+from tofuse.formats.images.images import write_png
 from tofuse.formats.poses.trajectory import write_tum
 from tofuse.formats.recordings.open import open_recording
 
@@ -135,6 +136,71 @@ def test_redwood(tmp_path: Path, color: str) -> None:
     assert recording.warnings == []
     frame = recording[0]
     assert frame.camera == Pinhole(640, 480, 500.0, 510.0, 321.0, 241.0)
+
+
+def test_redwood_uses_what_recorders_of_open3d_state(tmp_path: Path) -> None:
+    """As its readers of RealSense bags: unit and rate beside the lens."""
+    for name in ("depth", "color"):
+        (tmp_path / name).mkdir()
+        for k, counts in enumerate(COUNTS):
+            write_png(tmp_path / name / f"{k:05d}.png", counts)
+    matrix = [500.0, 0, 0, 0, 510.0, 0, 321.0, 241.0, 1]
+    facts = {"width": 640, "height": 480, "intrinsic_matrix": matrix, "fps": 30.0}
+    facts |= {"depth_scale": 4000.0, "device_name": "Intel RealSense L515"}
+    (tmp_path / "intrinsic.json").write_text(json.dumps(facts))
+    recording = open_recording(tmp_path)
+    frame = recording[1]
+    np.testing.assert_allclose(frame.depth[1:], COUNTS[1][1:] / 4000, rtol=1e-6)
+    np.testing.assert_allclose(recording.timestamps, np.arange(3) / 30)
+    assert recording.metadata["sensor"] == "Intel RealSense L515"
+    # Row by row, as people write it.
+    rows = [[500.0, 0, 321.0], [0, 510.0, 241.0], [0, 0, 1]]
+    facts |= {"intrinsic_matrix": rows}
+    (tmp_path / "intrinsic.json").write_text(json.dumps(facts))
+    assert open_recording(tmp_path)[0].camera == frame.camera
+    facts |= {"depth_scale": 0.001}
+    (tmp_path / "intrinsic.json").write_text(json.dumps(facts))
+    with pytest.raises(InputError, match=r"intrinsic\.json: depth_scale: is 0\.001"):
+        open_recording(tmp_path)
+
+
+def test_redwood_colour_of_another_rate_and_numbering(tmp_path: Path) -> None:
+    """By time if both are named by it, as in Redwood's data sets, or by equal names."""
+    make_redwood(tmp_path)
+    for path in (tmp_path / "color").iterdir():
+        path.unlink()
+    for k in range(5):
+        name = f"{k + 1:07d}-{k * 20000:012d}.png"
+        write_png(tmp_path / "color" / name, np.full((480, 640, 3), 40 * k, np.uint8))
+    colors = [frame.color_image[0, 0, 0] for frame in open_recording(tmp_path)]
+    assert colors == [0, 80, 120]  # of 0, 40 and 60 ms for 0, 33 and 67 ms
+    for k, path in enumerate(sorted((tmp_path / "depth").iterdir())):
+        path.rename(path.with_name(f"frame_{k + 9}.png"))
+    for k, path in enumerate(sorted((tmp_path / "color").iterdir())):
+        path.rename(path.with_name(f"frame_{k + 8}.png"))
+    colors = [frame.color_image[0, 0, 0] for frame in open_recording(tmp_path)]
+    assert colors == [40, 80, 120]
+
+
+def test_colour_of_camera_in_given_camera_json(tmp_path: Path) -> None:
+    """Colour of another size is sampled where each point projects."""
+    make_redwood(tmp_path)
+    for path in (tmp_path / "color").iterdir():
+        write_png(path, np.dstack([np.tile(np.arange(320) // 2, (240, 1))] * 3).astype(np.uint8))
+    with pytest.raises(InputError, match=r"pass its camera in camera\.json"):
+        open_recording(tmp_path)
+    lens = {"width": 320, "height": 240, "fx": 300.0, "fy": 300.0, "cx": 159.5, "cy": 119.5}
+    camera = {"schema": 1, "model": "pinhole", "width": 640, "height": 480}
+    camera |= {"fx": 600.0, "fy": 600.0, "cx": 319.5, "cy": 239.5}
+    camera |= {"depth_unit_m": 0.001, "depth_kind": "z"}
+    camera |= {"color": {"intrinsics": lens, "T_color_depth": np.eye(4).tolist()}}
+    (tmp_path / "given.json").write_text(json.dumps(camera))
+    frame = open_recording(tmp_path, camera=tmp_path / "given.json")[0]
+    expected = np.tile(np.arange(640) // 4, (480, 1))
+    seen = frame.color_image[..., 0] > 0
+    assert seen.mean() > 0.2  # random depth occludes
+    assert (np.abs(frame.color_image[..., 0].astype(int) - expected)[seen] <= 1).all()
+    assert frame.color_registered
 
 
 def test_redwood_with_fewer_colour_images_of_other_names(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import first_size
-from tofuse.formats.poses import read_poses
+from tofuse.formats.poses import associate, read_poses
 from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff, inputs
 
 # Open3D's PinholeCameraIntrinsicParameters.PrimeSenseDefault.
@@ -22,6 +23,7 @@ SENSOR, SIZE = "PrimeSense (structured light)", (640, 480)
 PRIMESENSE = Pinhole(*SIZE, 525.0, 525.0, 319.5, 239.5)
 
 _COLOR_FOLDERS = ("color", "image", "rgb")
+COLOR_LIMIT_S = 0.05
 _MICROSECONDS = re.compile(r"[0-9]+-([0-9]{12})")
 
 
@@ -55,21 +57,24 @@ class Redwood(Reader):
             reading.files_with(path / "depth", ".png"), ".png files", path / "depth"
         )
         warnings: list[str] = []
-        camera: Pinhole | None = None
+        # Open3D's recorders write this format with other cameras.
+        camera = _Camera(PRIMESENSE, sensor=SENSOR if first_size(files) == SIZE else "")
         if options.camera is None:
             file = _camera_file(path)
-            camera = PRIMESENSE if file is None else _read_intrinsics(file)
             if file is None:
                 warnings.append(
                     "no camera .json: the PrimeSense default is used (525 px); --camera to change"
                 )
+            else:
+                camera = _read_camera(file, camera.sensor)
+        times = _timestamps(files)
         source = DepthImageSource(
             files,
-            _timestamps(files),
-            camera,
-            color=_color_files(path, files, warnings),
-            # Open3D's recorders write this format with other cameras.
-            sensor=SENSOR if first_size(files) == SIZE else "",
+            np.arange(len(files)) / camera.rate if times is None else times,
+            camera.lens,
+            depth_unit_m=camera.unit,
+            color=_color_files(path, files, times, warnings),
+            sensor=camera.sensor,
             options=options,
         )
         source.warnings += warnings
@@ -93,34 +98,65 @@ def _camera_file(path: Path) -> Path | None:
     return cameras[0] if cameras else None
 
 
-def _read_intrinsics(path: Path) -> Pinhole:
+@dataclass(frozen=True)
+class _Camera:
+    """What the camera .json states, and Open3D's defaults."""
+
+    lens: Pinhole
+    sensor: str
+    unit: float = 0.001
+    rate: float = 1.0
+
+
+def _read_camera(path: Path, sensor: str) -> _Camera:
     data = reading.read_json(path)
     remedy = "write it as Open3D does, column by column"
-    K = reading.numbers_in(data, "intrinsic_matrix", path, (3, 3), remedy).T
+    K = reading.numbers_in(data, "intrinsic_matrix", path, (3, 3), remedy)
+    if K[2, :2].any() or not K[:2, 2].any():  # else it is written row by row
+        K = K.T
     width, height = (
         reading.number_in(data, name, path, remedy=remedy) for name in ("width", "height")
     )
-    return camera_file.checked_pinhole(K, camera_file.image_size(width, height, path), path)
+    lens = camera_file.checked_pinhole(K, camera_file.image_size(width, height, path), path)
+    # Open3D's readers of bags add these; other programs write the matrix alone.
+    counts_per_metre = reading.number_in(data, "depth_scale", path, 1000.0)
+    if not 10 <= counts_per_metre <= 1e6:
+        raise InputError(
+            f"is {counts_per_metre:g}",
+            where=f"{path}: depth_scale",
+            remedy="write the counts of depth in a metre, such as 1000",
+        )
+    rate = reading.number_in(data, "fps", path, 1.0)
+    sensor = str(data.get("device_name") or sensor)
+    return _Camera(lens, sensor, 1 / counts_per_metre, rate if 0.01 <= rate <= 1e4 else 1.0)
 
 
-def _timestamps(files: list[Path]) -> Float64:
-    """Seconds from names like 000001-000000033369.png (microseconds), else the index."""
+def _timestamps(files: list[Path]) -> Float64 | None:
+    """Seconds from names like 000001-000000033369.png (microseconds); None for other names."""
     matches = [_MICROSECONDS.fullmatch(f.stem) for f in files]
     times = np.array([int(m.group(1)) / 1e6 for m in matches if m])
-    if len(times) == len(files) and (np.diff(times) > 0).all():
-        return times
-    return np.arange(len(files), dtype=float)
+    increase = len(times) == len(files) and (np.diff(times) > 0).all()
+    return times if increase else None
 
 
-def _color_files(path: Path, files: list[Path], warnings: list[str]) -> list[Path | None] | None:
+def _color_files(
+    path: Path, files: list[Path], times: Float64 | None, warnings: list[str]
+) -> list[Path | None] | None:
+    """The colour image of each depth image: of the nearest time, the same place, name or number."""
     folder = next((path / n for n in _COLOR_FOLDERS if reading.is_folder(path / n)), None)
     if folder is None:
         return None
     color = reading.files_with(folder, ".png", ".jpg", ".jpeg")
-    if len(color) == len(files):
+    color_times = _timestamps(color)
+    if times is not None and color_times is not None:
+        nearest = associate(times, color_times, limit=COLOR_LIMIT_S, exclusive=False)
+        matches = [color[k] if k >= 0 else None for k in nearest]
+    elif len(color) == len(files):
         return list(color)
-    numbered = {number: file for file in color if (number := _number(file)) is not None}
-    matches = [numbered.get(number) if (number := _number(f)) is not None else None for f in files]
+    else:
+        named = {file.stem: file for file in color}
+        numbered = {_number(file): file for file in color if _number(file) is not None}
+        matches = [named.get(f.stem) or numbered.get(_number(f)) for f in files]
     if any(matches):
         return matches
     warnings.append(

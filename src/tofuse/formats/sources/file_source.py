@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import check_first_size, read_color, read_image
 from tofuse.formats.sources.inputs import read_timestamps, tum_poses
+from tofuse.formats.sources.pixels import sampled_color
 from tofuse.formats.sources.reader import ReaderOptions
 
 
@@ -125,7 +127,7 @@ class FileSource(ABC):
 
 
 class DepthImageSource(FileSource):
-    """Depth images, with colour images registered to them where given.
+    """Depth images, with colour images where given, registered to them or of another camera.
 
     Parameters
     ----------
@@ -138,7 +140,9 @@ class DepthImageSource(FileSource):
     color
         None, or one image per frame, None where there is none.
     color_registered
-        Whether colour is registered to depth.
+        Whether colour is registered to depth, if it has no camera of its own.
+    color_camera
+        Of colour that isn't registered, unless `options` has a camera.json with one.
     sensor
         Name of the camera, unless `options` has a camera.json that names it; empty if unknown.
     options
@@ -161,12 +165,13 @@ class DepthImageSource(FileSource):
         depth_unit_m: float = 0.001,
         color: Sequence[Path | None] | None = None,
         color_registered: bool = True,
+        color_camera: camera_file.ColorCamera | None = None,
         sensor: str = "",
         options: ReaderOptions | None = None,
     ) -> None:
         super().__init__(timestamps)
         self.files, self.color = list(files), None if color is None else list(color)
-        self.color_registered = color_registered
+        self.color_registered, self.color_camera = color_registered, color_camera
         where = "the camera of this format"
         if options is not None and options.camera is not None:
             sensor = self.use_camera(options.camera).sensor or sensor
@@ -189,15 +194,17 @@ class DepthImageSource(FileSource):
         """See `FileSource.load`."""
         size = (self.camera.width, self.camera.height)
         counts = read_image(self.files[index], size=size, dtype="uint16")
-        color = None
+        frame = self.image(index, depth_counts.depth_from_counts(counts, self.unit))
         path = None if self.color is None else self.color[index]
-        if path is not None:
-            color = read_color(path)
-            if color.shape[:2] != counts.shape:
-                raise InputError(
-                    f"is {color.shape[1]} x {color.shape[0]} pixels, depth {size[0]} x {size[1]}",
-                    where=path,
-                    remedy="register colour to depth, or leave it out",
-                )
-        depth = depth_counts.depth_from_counts(counts, self.unit)
-        return self.image(index, depth, color_image=color, color_registered=self.color_registered)
+        if path is None:
+            return frame
+        color, registered = read_color(path), self.color_registered
+        if self.color_camera is not None:
+            color, registered = sampled_color(frame, color, self.color_camera, path), True
+        elif color.shape[:2] != counts.shape:
+            raise InputError(
+                f"is {color.shape[1]} x {color.shape[0]} pixels, depth {size[0]} x {size[1]}",
+                where=path,
+                remedy="register colour to depth, pass its camera in camera.json, or leave it out",
+            )
+        return replace(frame, color_image=color, color_registered=registered)
