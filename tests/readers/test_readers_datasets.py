@@ -98,6 +98,45 @@ def test_tum_with_unknown_name_requires_camera(tmp_path: Path) -> None:
     assert family_of(recording, frame) == "ifm-o3r"
 
 
+def test_tum_camera_of_other_data_sets(tmp_path: Path) -> None:
+    """Bonn's by the name of the folder, ETH3D's from calibration.txt."""
+    make_tum(tmp_path / "rgbd_bonn_balloon")
+    bonn = open_recording(tmp_path / "rgbd_bonn_balloon")[0].camera
+    assert isinstance(bonn, BrownConrady)
+    assert (bonn.fx, bonn.k2) == (542.822841, -0.099343)
+    make_tum(tmp_path / "cables_1")
+    (tmp_path / "cables_1" / "calibration.txt").write_text("726.2 726.3 359.2 202.5\n")
+    recording = open_recording(tmp_path / "cables_1")
+    assert recording[0].camera == Pinhole(640, 480, 726.2, 726.3, 359.2, 202.5)
+    assert "sensor" not in recording.metadata
+    (tmp_path / "cables_1" / "calibration.txt").write_text("726.2 726.3\n")
+    with pytest.raises(InputError, match=r"calibration\.txt: is not one line"):
+        open_recording(tmp_path / "cables_1")
+
+
+@pytest.mark.parametrize("order", ["depth first", "colour first"])
+def test_tum_with_list_of_pairs_alone(tmp_path: Path, order: str) -> None:
+    """As ICL-NUIM's, in which depth is first; associate.py writes colour first."""
+    lines = []
+    for k, counts in enumerate(COUNTS):
+        for name in ("depth", "rgb"):
+            (tmp_path / name).mkdir(exist_ok=True)
+        write_png(tmp_path / "depth" / f"{k + 9}.png", counts)
+        write_png(tmp_path / "rgb" / f"{k + 9}.png", np.full((480, 640, 3), k, np.uint8))
+        pair = [f"{k + 9} depth\\{k + 9}.png", f"{k + 9} rgb/{k + 9}.png"]
+        lines.append(" ".join(pair if order == "depth first" else pair[::-1]))
+    (tmp_path / "associations.txt").write_text("\r\n".join(lines))
+    with pytest.raises(InputError, match=r"--camera camera\.json.*depth_unit_m 0\.0002"):
+        open_recording(tmp_path)
+    (tmp_path / "calibration.txt").write_text("481.2 480 319.5 239.5")
+    recording = open_recording(tmp_path)
+    assert recording.format == "tum"
+    for k, frame in enumerate(recording):
+        np.testing.assert_allclose(frame.depth[1:], COUNTS[k][1:] / 5000, rtol=1e-6)
+        assert (frame.color_image == k).all()
+    np.testing.assert_array_equal(recording.timestamps, [9, 10, 11])
+
+
 def test_7scenes(tmp_path: Path) -> None:
     make_7scenes(tmp_path / "seq-01")
     recording = open_recording(tmp_path / "seq-01")

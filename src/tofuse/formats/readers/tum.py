@@ -8,15 +8,18 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras import BrownConrady
+from tofuse.engine.cameras import BrownConrady, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.formats.files import reading
+from tofuse.formats.cameras import camera_file
+from tofuse.formats.files import reading, tables
+from tofuse.formats.images import first_size
 from tofuse.formats.poses import associate
 from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff, inputs
 
 DEPTH_UNIT_M = 1 / 5000
 COLOR_LIMIT_S = 0.1
+_PAIRS = re.compile(r"assoc[a-z]*\.txt")
 SENSOR = "Kinect v1 or Xtion (structured light)"  # of the benchmark
 
 # Of the colour cameras: depth is registered to colour (infrared ones nearly double errors).
@@ -30,34 +33,43 @@ CAMERAS = {
         0.231222, -0.784899, -0.003257, -0.000105, 0.917205,
     ),
     "freiburg3": BrownConrady(640, 480, 535.4, 539.2, 320.1, 247.6),
+    "bonn": BrownConrady(
+        640, 480, 542.822841, 542.576870, 315.593520, 237.756098,
+        0.039903, -0.099343, -0.000730, -0.000144, 0.0,
+    ),
 }  # fmt: skip
 
 
 @part("reader", "tum")
 class Tum(Reader):
-    """TUM RGB-D: folders with depth.txt (timestamp and file name), maybe rgb.txt."""
+    """TUM RGB-D, Bonn, ETH3D: folders with depth.txt, maybe rgb.txt, or with associations.txt."""
 
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         if reading.is_folder(path) and reading.is_file(path / "depth.txt"):
             return Sniff(1.0, "depth.txt")
-        return None
+        pairs = _pairs_file(path)
+        return None if pairs is None else Sniff(1.0, f"{pairs.name} with depth images")
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        times, files = _read_list(path / "depth.txt")
-        camera = camera_of(path)
+        lists = _read_lists(path)
+        times, files = lists[0]
+        named = camera_of(path)
+        camera = _calibrated(path / "calibration.txt", files) or named
         if camera is None and options.camera is None:
             raise InputError(
-                "is a TUM folder without a camera in its name (freiburg1, 2 or 3)",
+                "is a TUM folder without calibration.txt, or a camera in its name (freiburg1, 2 "
+                "or 3, rgbd_bonn)",
                 where=path,
-                remedy="pass the colour camera with --camera camera.json",
+                remedy="pass the colour camera with --camera camera.json, where the unit of TUM's "
+                f"depth is depth_unit_m {DEPTH_UNIT_M:g}",
             )
         warnings: list[str] = []
         inputs.check_timestamps(times, path / "depth.txt", warnings)
         color: list[Path | None] | None = None
-        if reading.is_file(path / "rgb.txt"):
-            color_times, color_files = _read_list(path / "rgb.txt")
+        if len(lists) > 1:
+            color_times, color_files = lists[1]
             # A depth image without a colour image takes that of a neighbour: only for display.
             pairs = associate(times, color_times, limit=COLOR_LIMIT_S, exclusive=False)
             if (pairs >= 0).any():
@@ -75,7 +87,7 @@ class Tum(Reader):
             camera,
             depth_unit_m=DEPTH_UNIT_M,
             color=color,
-            sensor="" if camera is None else SENSOR,
+            sensor="" if named is None else SENSOR,
             options=options,
         )
         source.warnings += warnings
@@ -86,22 +98,56 @@ class Tum(Reader):
 
 def camera_of(path: Path) -> BrownConrady | None:
     """Return the colour camera, identified by the name of the folder or its parent."""
-    for name in (path.absolute().name, path.absolute().parent.name):
-        match = re.search(r"(?<![a-z])(?:freiburg|fr)([123])(?![0-9])", name.lower())
+    for name in (path.absolute().name.lower(), path.absolute().parent.name.lower()):
+        match = re.search(r"(?<![a-z])(?:freiburg|fr)([123])(?![0-9])", name)
         if match:
             return CAMERAS[f"freiburg{match.group(1)}"]
+        if "rgbd_bonn" in name:
+            return CAMERAS["bonn"]
     return None
 
 
-def _read_list(path: Path) -> tuple[Float64, list[Path]]:
+def _calibrated(path: Path, files: list[Path]) -> Pinhole | None:
+    """The camera of a calibration.txt, as of ETH3D: fx, fy, cx and cy in one line."""
+    if not reading.is_file(path):
+        return None
+    table = tables.read_numbers(path)
+    if table.shape != (1, 4):
+        raise InputError("is not one line of fx fy cx cy", where=path, remedy="correct it there")
+    fx, fy, cx, cy = table[0]
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return camera_file.checked_pinhole(K, first_size(files), path)
+
+
+def _pairs_file(path: Path) -> Path | None:
+    """The list of pairs of images that associate.py writes, if there is one that names depth."""
+    files = reading.files_named(path, _PAIRS.fullmatch)
+    return next((f for f in files if b"depth" in reading.read_head(f, 4096)), None)
+
+
+def _read_lists(path: Path) -> list[tuple[Float64, list[Path]]]:
+    """The times and files of depth, and of colour if there is any."""
+    if reading.is_file(path / "depth.txt"):
+        names = ["depth.txt", *(["rgb.txt"] if reading.is_file(path / "rgb.txt") else [])]
+        return [_read_list(path / name) for name in names]
+    pairs = _pairs_file(path)
+    if pairs is None:
+        raise InputError("has no depth.txt", where=path, remedy="check the path")
+    lists = [_read_list(pairs, column) for column in (0, 2)]
+    # Depth comes first or second.
+    return lists if "depth" in str(lists[0][1][0].relative_to(path)) else lists[::-1]
+
+
+def _read_list(path: Path, column: int = 0) -> tuple[Float64, list[Path]]:
     times, files = [], []
     for number, line in enumerate(reading.read_text(path).splitlines(), 1):
         cells = line.split("#", 1)[0].split()
         if not cells:
             continue
+        cells = cells[column:]
         try:
             times.append(float(cells[0]))
-            name = Path(cells[1])
+            name = Path(cells[1].replace("\\", "/"))
         except (ValueError, IndexError) as error:
             raise InputError(
                 "isn't a timestamp and a file name", where=f"{path}, line {number}"
