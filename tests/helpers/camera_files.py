@@ -32,6 +32,7 @@ MAKERS: dict[str, tuple[Callable[[Path], object], str | None, str]] = {
     "o3r": (made_ifm.make_o3r, "a.data", "ifm-o3r"),
     "npz": (made_arrays.make_npz, "a.npz", "npz"),
     "sens": (made_sens.make_sens, "a.sens", "sens"),
+    "scannet": (made_sens.make_scannet, None, "scannet"),
     "zense": (made_arrays.make_zense, None, "zense"),
     "helios": (made_exports.make_helios, None, "grid"),
     "csv": (made_exports.make_csv, None, "grid"),

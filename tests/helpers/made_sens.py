@@ -54,3 +54,21 @@ def make_sens(path: Path, *, depth: str = "zlib", color: str = "jpeg") -> None:
         data += struct.pack("<4Q", 33_333 * k, 33_333 * k + 10, len(packed), len(counts))
         data += packed + counts
     path.write_bytes(data + struct.pack("<Q", 0))  # no IMU data
+
+
+def make_scannet(folder: Path) -> None:
+    """The same recording, as ScanNet's tools export it."""
+    for name in ("depth", "color", "pose", "intrinsic"):
+        (folder / name).mkdir(parents=True)
+    place = np.eye(4)
+    place[0, 3] = BASELINE_M
+    np.savetxt(folder / "intrinsic" / "intrinsic_depth.txt", lens(35.0, 19.5, 14.5))
+    np.savetxt(folder / "intrinsic" / "extrinsic_depth.txt", np.eye(4))
+    np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", lens(70.0, 39.5, 29.5))
+    np.savetxt(folder / "intrinsic" / "extrinsic_color.txt", place)
+    for k in range(3):
+        image = np.full((COLOR_HEIGHT, COLOR_WIDTH, 3), COLORS[k])
+        cv2.imwrite(str(folder / "depth" / f"{k}.png"), DEPTH[k])
+        cv2.imwrite(str(folder / "color" / f"{k}.jpg"), image[..., ::-1])
+        T = np.full((4, 4), -np.inf) if k == 1 else pose(k)
+        np.savetxt(folder / "pose" / f"{k}.txt", T)

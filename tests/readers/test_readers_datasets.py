@@ -156,6 +156,50 @@ def test_7scenes(tmp_path: Path) -> None:
     assert frame.camera == Pinhole(640, 480, 500.0, 510.0, 320.0, 240.0)
 
 
+INFO = """m_versionNumber = 4
+m_sensorName = StructureSensor
+m_colorWidth = 320
+m_colorHeight = 240
+m_depthWidth = 640
+m_depthHeight = 480
+m_depthShift = 5000
+m_calibrationColorIntrinsic = 290 0 160 0 0 290 120 0 0 0 1 0 0 0 0 1
+m_calibrationColorExtrinsic = 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1
+m_calibrationDepthIntrinsic = 583 0 320 0 0 584 240 0 0 0 1 0 0 0 0 1
+m_calibrationDepthExtrinsic = 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1
+m_frames.size = 3
+"""
+
+
+@pytest.mark.parametrize("place", ["apt0", "office2/data"], ids=["BundleFusion", "12-Scenes"])
+def test_cameras_in_info_file(tmp_path: Path, place: str) -> None:
+    """Beside the frames, or above; colour has its own camera there."""
+    make_7scenes(tmp_path / place)
+    for path in (tmp_path / place).glob("*.color.png"):
+        write_png(path, np.full((240, 320, 3), 77, np.uint8))
+    info = tmp_path / place.split("/")[0] / "info.txt"
+    info.write_text(INFO)
+    recording = open_recording(tmp_path / place)
+    frame = recording[1]
+    assert frame.camera == Pinhole(640, 480, 583.0, 584.0, 320.0, 240.0)
+    np.testing.assert_allclose(frame.depth[1:], COUNTS[1][1:] / 5000, rtol=1e-6)
+    assert frame.color_registered
+    assert set(np.unique(frame.color_image)) == {0, 77}  # occluded, or seen
+    assert recording.metadata["sensor"] == "StructureSensor"
+    assert recording.warnings == []
+    info.write_text(INFO.replace("583 0", "wide 0"))
+    with pytest.raises(InputError, match=r"info\.txt: m_calibrationDepthIntrinsic: is missing, or"):
+        open_recording(tmp_path / place)
+
+
+def test_camera_of_3dmatch_is_above_its_sequences(tmp_path: Path) -> None:
+    make_7scenes(tmp_path / "seq-01")
+    (tmp_path / "camera-intrinsics.txt").write_text("572 0 320\n0 573 240\n0 0 1\n")
+    for path in (tmp_path / "seq-01", tmp_path):
+        camera = open_recording(path)[0].camera
+        assert camera == Pinhole(640, 480, 572.0, 573.0, 320.0, 240.0)
+
+
 @pytest.mark.parametrize("color", ["color", "image", "rgb"])
 def test_redwood(tmp_path: Path, color: str) -> None:
     make_redwood(tmp_path, color)

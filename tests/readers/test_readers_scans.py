@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import tofuse
-from made_sens import BASELINE_M, COLORS, DEPTH, HEIGHT, WIDTH, make_sens, pose
+from made_phones import jpeg
+from made_sens import BASELINE_M, COLORS, DEPTH, HEIGHT, WIDTH, make_scannet, make_sens, pose
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
@@ -54,6 +55,24 @@ def test_sens_color_is_projected_from_its_own_camera(tmp_path: Path) -> None:
     outside = np.rint(column) < 0
     assert outside.any()
     assert not frame.color_image[v, u][outside].any()
+
+
+def test_exported_sens_is_the_same_recording(tmp_path: Path) -> None:
+    make_sens(tmp_path / "scene.sens", color="jpeg")
+    make_scannet(tmp_path / "scene0000_00")
+    original, export = (tofuse.open(tmp_path / name) for name in ("scene.sens", "scene0000_00"))
+    assert export.format == "scannet"
+    np.testing.assert_allclose(export.reference, original.reference)
+    np.testing.assert_allclose(np.diff(export.timestamps), 1 / 30)
+    for k in range(3):
+        np.testing.assert_allclose(image(export, k).points, image(original, k).points, rtol=1e-6)
+        np.testing.assert_array_equal(image(export, k).color_image, image(original, k).color_image)
+        assert image(export, k).color_registered
+    # Colour reduced to other pixels than those of its lens.
+    for path in (tmp_path / "scene0000_00" / "color").iterdir():
+        path.write_bytes(jpeg(np.zeros((30, 40, 3), np.uint8)))
+    export = tofuse.open(tmp_path / "scene0000_00")
+    assert export.warnings == ["the lens of color/ is of images of another size: colour is ignored"]
 
 
 def test_invalid_sens_is_refused(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ METRES: dict[str, tuple[str, str, Callable[[Path], Path]]] = {
     "ros-metres": ("a", "ros", ros_metres),
 }
 TAKES = ["native", "tum", "7scenes", "redwood", "mkv", "zense", "sens", "npz", "realsense"]
-TAKES += ["orbbec", "kinect2", "depth16", "arducam", "aditof", "mcap"]
+TAKES += ["orbbec", "kinect2", "depth16", "arducam", "aditof", "mcap", "scannet"]
 REFUSES = [name for name in EVERY if name not in TAKES]
 
 

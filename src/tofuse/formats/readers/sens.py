@@ -14,7 +14,6 @@ import numpy as np
 from tofuse.engine.arrays import Float64, UInt8, UInt16
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_counts
-from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
@@ -139,23 +138,9 @@ class SensSource(FileSource):
         if all(1 < side <= _MAX_SIDE for side in color_size) and self.color_packing in _COLORS:
             self.color_camera = camera_file.ColorCamera(
                 camera_file.checked_pinhole(color_lens, color_size, f"{self.path}: color lens"),
-                self._T_color_depth(T_device_color, T_device_depth),
+                inputs.color_from_depth(self.warnings, T_device_color, T_device_depth, self.path),
             )
         return count
-
-    def _T_color_depth(self, T_device_color: Float64, T_device_depth: Float64) -> Float64:
-        """T_color_depth (4, 4); identity if not given."""
-        try:
-            poses = [
-                inputs.read_matrix_pose(T, f"{self.path}: extrinsics")
-                for T in (T_device_color, T_device_depth)
-            ]
-        except InputError as error:
-            self.warnings.append(f"{error}; colour is assumed to have the pose of depth")
-            return np.eye(4)
-        if not np.isfinite(poses).all():
-            return np.eye(4)
-        return se3.inverse(poses[0]) @ poses[1]
 
     def _locate_frames(self, file: BinaryIO, count: int) -> Iterator[tuple[_Entry, int, Float64]]:
         """Locate frames until the end of the file; a truncated one is skipped."""

@@ -141,6 +141,20 @@ def read_matrix_pose(table: Float64, where: str) -> Float64:
     return se3.orthonormalise(se3.check_pose(table, where=where))
 
 
+def color_from_depth(
+    warnings: list[str], T_device_color: Float64, T_device_depth: Float64, where: str | Path
+) -> Float64:
+    """Return T_color_depth (4, 4) of two poses of a file; identity if they are invalid."""
+    try:
+        poses = [
+            read_matrix_pose(T, f"{where}: extrinsics") for T in (T_device_color, T_device_depth)
+        ]
+    except InputError as error:
+        warnings.append(f"{error}; colour is assumed to have the pose of depth")
+        return np.eye(4)
+    return se3.inverse(poses[0]) @ poses[1] if np.isfinite(poses).all() else np.eye(4)
+
+
 def read_timestamps(path: Path, count: int, warnings: list[str]) -> Float64:
     """Read a timestamps.txt: (N,) seconds for `count` frames."""
     table = tables.read_numbers(path)
