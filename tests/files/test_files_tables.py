@@ -15,6 +15,18 @@ def test_numbers_are_read_with_any_separator(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_numbers(tmp_path / "a.txt"), [[1, 2, 3], [4, 5, 6]])
 
 
+def test_header_of_cloudcompare_is_a_comment(tmp_path: Path) -> None:
+    (tmp_path / "a.xyz").write_text("//X Y Z\n1 2 3\n")
+    np.testing.assert_array_equal(read_numbers(tmp_path / "a.xyz"), [[1, 2, 3]])
+
+
+@pytest.mark.parametrize("text", ["1,5 2,5 3,5\n", "x;y\n-1,5;2,5\n", "1,5\t-2,5\n"])
+def test_decimal_commas_are_no_separators(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(InputError, match=r"a\.csv: writes numbers with commas \(1,5\)"):
+        read_numbers(tmp_path / "a.csv")
+
+
 @pytest.mark.parametrize("text", ["1 2\n3\n", "1 b\n", "1 2\n3 4 5\n", "\0\0\0\0"])
 def test_bad_numbers_are_rejected(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.txt").write_text(text)

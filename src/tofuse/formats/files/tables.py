@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,11 +14,14 @@ from tofuse.engine.errors import InputError
 from tofuse.formats.files.atomic import write_text
 from tofuse.formats.files.reading import read_text
 
+# As separators, commas are not mixed with others: "1,5 2,5" and "1,5;2,5" are two numbers each.
+_DECIMAL_COMMA = re.compile(r"\b([0-9]+,[0-9]+)[ \t;]+[-+]?[0-9]+,[0-9]")
+
 
 def parse_numbers(text: str, path: str | Path, *, skip: int = 0) -> Float64:
     """Parse rows of numbers, (N, C).
 
-    Separators are blanks, commas and semicolons; '#' starts a comment.
+    Separators are blanks, commas and semicolons; '#' and '//' (of CloudCompare) start a comment.
 
     Parameters
     ----------
@@ -31,14 +35,21 @@ def parse_numbers(text: str, path: str | Path, *, skip: int = 0) -> Float64:
     Raises
     ------
     InputError
-        If a cell is not a number, or rows have different lengths.
+        If a cell is not a number, decimals are written with commas, or rows have different lengths.
     """
+    if "," in text and (decimal := _DECIMAL_COMMA.search(text)):
+        raise InputError(
+            f"writes numbers with commas ({decimal.group(1)})",
+            where=path,
+            remedy="write them with points, such as 1.5",
+        )
     text = text.replace(",", " ").replace(";", " ")
     if "\0" in text:
         raise InputError("is not text", where=path, remedy="check the file")
     lines = text.splitlines()[skip:]
-    if "#" in text:
-        lines = [line.split("#", 1)[0] for line in lines]
+    for mark in ("#", "//"):
+        if mark in text:
+            lines = [line.split(mark, 1)[0] for line in lines]
     lines = [line for line in lines if line.strip()]
     if not lines:
         return np.zeros((0, 0))
