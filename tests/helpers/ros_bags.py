@@ -132,12 +132,14 @@ class Bag:
         model: str = "plumb_bob",
         D: tuple[float, ...] = (0.1, 0.02),
         lens: Pinhole = DEPTH_LENS,
+        P: np.ndarray | None = None,
     ) -> None:
         K = np.array([lens.fx, 0, lens.cx, 0, lens.fy, lens.cy, 0, 0, 1])
         roi = self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
         D = (*D, *(0.0,) * (5 - len(D)))
         size = (lens.height, lens.width)
-        values = (*size, model, np.array(D), K, np.eye(3).ravel(), np.zeros(12), 0, 0, roi)
+        values = (*size, model, np.array(D), K, np.eye(3).ravel())
+        values = (*values, np.zeros(12) if P is None else P.ravel(), 0, 0, roi)
         self.write(topic, ros.INFO, 10.0, self.make(ros.INFO, self.header(10.0), *values))
 
     def cloud(

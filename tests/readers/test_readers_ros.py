@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import shutil
 import struct
 import sys
 import tempfile
@@ -56,6 +57,60 @@ def test_depth_images(tmp_path: Path, kind: str) -> None:
         assert frame.camera == BrownConrady(16, 12, 20.0, 21.0, 7.5, 5.5, k1=0.1, k2=0.02)
         np.testing.assert_allclose(frame.z, COUNTS[k] / 1000, rtol=1e-6)
         assert frame.timestamp == recording.timestamps[k]
+
+
+@pytest.mark.parametrize(
+    ("topic", "rectified"),
+    [
+        ("/a/depth/image_rect", True),
+        ("/a/depth/image_rect_raw/compressedDepth", True),
+        ("/a/depth/image_raw", False),
+        ("/direct/depth/image_raw", False),
+    ],
+)
+def test_lens_of_rectified_images(tmp_path: Path, topic: str, rectified: bool) -> None:
+    """It is P of CameraInfo, without the distortion of the images that were rectified."""
+    bag = Bag(tmp_path, "ros2")
+    P = np.array([[18.0, 0, 7.25, 0], [0, 19.0, 5.25, 0], [0, 0, 1, 0]])
+    bag.info(f"{topic.split('/image')[0]}/camera_info", P=P)
+    if topic.endswith("compressedDepth"):
+        data = bytes(12) + png_bytes(COUNTS[0])
+        bag.compressed(topic, 10, data, "16UC1; compressedDepth png")
+    else:
+        bag.image(topic, 10, COUNTS[0], "16UC1")
+    camera = open_recording(bag.close())[0].camera
+    raw = BrownConrady(16, 12, 20.0, 21.0, 7.5, 5.5, k1=0.1, k2=0.02)
+    assert camera == (Pinhole(16, 12, 18.0, 19.0, 7.25, 5.25) if rectified else raw)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_file_of_bag_alone_in_a_folder(tmp_path: Path, kind: str) -> None:
+    """Copied without the metadata.yaml of ROS 2, or into a folder with notes."""
+    (tmp_path / "bag").mkdir()
+    bag = Bag(tmp_path / "bag", kind)
+    bag.info("/a/depth/camera_info")
+    bag.image(TOPIC, 10, COUNTS[0], "16UC1")
+    bag.close()
+    (file,) = (p for p in (tmp_path / "bag").rglob("a.*") if p.suffix in (".bag", ".db3", ".mcap"))
+    (tmp_path / "copy").mkdir()
+    (tmp_path / "copy" / "notes.txt").write_text("")
+    shutil.copy(file, tmp_path / "copy")
+    assert len(open_recording(tmp_path / "copy")) == 1
+    shutil.copy(file, tmp_path / "copy" / f"b{file.suffix}")
+    with pytest.raises(InputError, match=r"several recordings: a\.\w+ \(ros\), b\.\w+ \(ros\)"):
+        open_recording(tmp_path / "copy")
+    file.write_bytes(b"")
+    with pytest.raises(InputError, match=r"a\.\w+: is empty"):
+        open_recording(file)
+
+
+def test_mcap_of_another_program_is_refused_by_its_profile(tmp_path: Path) -> None:
+    profile = b"protobuf"
+    header = struct.pack("<I", len(profile)) + profile + struct.pack("<I", 0)
+    record = b"\x01" + struct.pack("<Q", len(header)) + header
+    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + record + bytes(100))
+    with pytest.raises(InputError, match=r"no messages of ROS 2 \(its profile is 'protobuf'\)"):
+        open_recording(tmp_path / "a.mcap")
 
 
 def test_compressed_depth(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
 _AMPLITUDE_KEYWORDS = ("/ir/", "/infra", "amplitude", "intensity", "reflec")
 _COLOR_KEYWORDS = ("color", "colour", "rgb")
+# Topics of rectified images, of which CameraInfo's P is the lens, without distortion.
+_RECTIFIED = re.compile(r"(?<![a-z])rect(?![a-z])|rectified")
 # Prefix of drifting odometry frames; frames above them are corrected.
 _ODOMETRY = "odom"
 
@@ -161,7 +164,7 @@ class RosSource(bags.BagSource):
                 where=self.path,
                 remedy="pass the depth camera with --camera camera.json",
             )
-        self.camera = self._lens_of(candidates[0])
+        self.camera = self._lens_of(candidates[0], self.connection)
 
     def _camera_infos(self, connection: Any) -> list[Any]:
         """The CameraInfo connections in the namespace of an image connection."""
@@ -239,7 +242,9 @@ class RosSource(bags.BagSource):
         if not (same_size and (registered or depth_frame == color_frame)):
             if T is None or not infos:
                 return False
-            self.color_camera = camera_file.ColorCamera(self._lens_of(infos[0]), T)
+            self.color_camera = camera_file.ColorCamera(
+                self._lens_of(infos[0], track.connection), T
+            )
         self.color = track
         return True
 
@@ -251,10 +256,13 @@ class RosSource(bags.BagSource):
             return True
         return connection.msgtype == IMAGE and self._encoding(connection).lower() in bags.COLORS
 
-    def _lens_of(self, info: Any) -> Pinhole:
+    def _lens_of(self, info: Any, images: Any) -> Pinhole:
+        """The lens of a CameraInfo for a topic of images."""
         where = f"{self.path}: {info.topic}"
+        rectified = _RECTIFIED.search(images.topic.lower()) is not None
         for _, _, raw in self.bag.messages(connections=[info]):
-            return bags.lens(self.bag.deserialize(raw, info.msgtype), where)
+            message = self.bag.deserialize(raw, info.msgtype)
+            return bags.lens(message, where, rectified=rectified)
         raise InputError("has no message", where=where, remedy="use --camera camera.json")
 
     def _find_amplitude(self) -> bags.Track | None:

@@ -22,7 +22,7 @@ from tofuse.formats.recordings.archives import unzipped
 from tofuse.formats.recordings.joined import JoinedSource, LimitedSource
 from tofuse.formats.recordings.still import average_still
 from tofuse.formats.rigs import RigSource, read_rig, recordings_of, rig_file_in
-from tofuse.formats.sources import Reader, ReaderOptions, Sniff, organised
+from tofuse.formats.sources import Reader, ReaderOptions, Sniff, inputs, organised
 
 # Proprietary recordings: problem and remedy by suffix.
 CLOSED = {
@@ -36,6 +36,9 @@ CLOSED = {
         "play it by Kinect Studio and save its depth images, or record by iai_kinect2",
     ),
 }
+
+# A single file of these, which contain a whole recording, is that of its folder.
+_CONTAINERS = (".bag", ".db3", ".mcap", ".mkv", ".sens", ".r3d", ".npz", ".h5", ".e57")
 
 # A folder with these may contain depth images of an unknown camera.
 _IMAGES = (".png", ".pgm", ".tif", ".tiff", ".jpg", ".jpeg")
@@ -63,7 +66,7 @@ def open_recording(
         Files, folders or .zip files of these; several are joined in the order given. A folder of
         native or SR4000 recordings is joined in name order; if it contains a rig.json, its
         recordings are the cameras of a rig, one image of each in turn. A folder with a single
-        recording in one of its folders stands for it.
+        recording in it stands for that.
     format
         Name of a reader, instead of detection.
     camera
@@ -234,18 +237,18 @@ def _recordings_in(path: Path) -> list[_Located]:
     """The recordings in a folder, if any; InputError if there are several that can't be joined."""
     format_of: dict[Path, str] = {}
     best = 0.0
-    for folder in _folders_in(path):
-        sniffs = _sniff(folder)
+    for part in [*_folders_in(path), *inputs.files_at(path, *_CONTAINERS)]:
+        sniffs = _sniff(part)
         confident = [name for name, s in sniffs.items() if s.confidence >= Sniff.CERTAIN]
         if confident:
-            format_of[folder] = max(confident, key=lambda name: sniffs[name].confidence)
-            best = max(best, sniffs[format_of[folder]].confidence)
+            format_of[part] = max(confident, key=lambda name: sniffs[name].confidence)
+            best = max(best, sniffs[format_of[part]].confidence)
     if not format_of:
         return []
     formats = sorted(set(format_of.values()))
     listed = ", ".join(f"{p.name} ({name})" for p, name in list(format_of.items())[:6])
     reader = readers()[formats[0]]
-    if len(format_of) == 1 and not reader.joinable and best < 1:
+    if len(format_of) == 1 and not reader.joinable and best <= Sniff.CERTAIN:
         # A model, say, among folders of an unknown format.
         raise InputError(f"contains only {listed}", where=path, remedy="pass that, if you mean it")
     if len(format_of) > 1 and (len(formats) > 1 or not reader.joinable):
@@ -273,6 +276,8 @@ def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) ->
         problem = f"is not a recording of a known format: it contains {evidence}"
         if any(kind.lower() in _IMAGES for kind in kinds):
             remedy = "if these are depth images, move them to depth/ in it and add a camera.json"
+    elif path.stat().st_size == 0:
+        return InputError("is empty", where=path, remedy="copy the file again")
     else:
         problem = f"is not a recording of a known format, but a {path.suffix!r} file"
     return InputError(

@@ -29,6 +29,7 @@ from tofuse.formats.sources.reader import ReaderOptions
 
 REMEDY = "check the bag, or reindex it"
 MAX_GAP_S = 0.02  # between the images of one frame
+_PROFILE = 21  # of MCAP's header: after magic, record type, and two lengths
 _MAGIC = {"ros1": b"#ROSBAG V2", "mcap": b"\x89MCAP0\r\n"}
 
 
@@ -63,8 +64,24 @@ def open_bag(path: Path) -> Any:
                 raise InputError(
                     "is not a regular file", where=entry, remedy="remove it from the bag"
                 )
+    _check_profile(path)
     types = typesys.get_typestore(typesys.Stores.LATEST)
     return _opened(path, lambda: highlevel.AnyReader([path], default_typestore=types))
+
+
+def _check_profile(path: Path) -> None:
+    """Refuse MCAP files of other programs than ROS 2, which its header names."""
+    head = reading.read_head(path, 64) if reading.is_file(path) else b""
+    if len(head) < _PROFILE or not head.startswith(_MAGIC["mcap"]):
+        return
+    (length,) = struct.unpack_from("<I", head, _PROFILE - 4)
+    profile = head[_PROFILE : _PROFILE + length].decode("utf-8", "replace")
+    if profile != "ros2":
+        raise InputError(
+            f"contains no messages of ROS 2 (its profile is {profile!r:.40})",
+            where=path,
+            remedy="convert it to a ROS bag, or save its images as .npz (docs/formats.md)",
+        )
 
 
 def open_container(path: Path) -> Any:
@@ -384,8 +401,8 @@ def camera_info(message: Any, where: str) -> Info:
     return Info((int(message.width), int(message.height)), values, str(message.distortion_model), D)
 
 
-def lens(message: Any, where: str) -> Pinhole:
-    """Return the lens of a CameraInfo.
+def lens(message: Any, where: str, *, rectified: bool = False) -> Pinhole:
+    """Return the lens of a CameraInfo, or, if `rectified`, that of the images made from it: of P.
 
     Raises
     ------
@@ -394,6 +411,9 @@ def lens(message: Any, where: str) -> Pinhole:
     """
     info = camera_info(message, where)
     model, D = info.model, info.coefficients
+    P = np.asarray(getattr(message, "p", getattr(message, "P", ())), float)
+    if rectified and P.shape == (12,) and P[0] > 0 and P[5] > 0:
+        return camera_file.checked_pinhole(P.reshape(3, 4), info.size, where)
     name = "pinhole"
     if any(D):
         if model in ("equidistant", "fisheye"):
