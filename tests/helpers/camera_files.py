@@ -27,6 +27,7 @@ from tofuse.formats.recordings.open import open_recording
 MAKERS: dict[str, tuple[Callable[[Path], object], str | None, str]] = {
     "3dscannerapp": (made_phones.make_scanner_app, None, "3dscannerapp"),
     "stray": (made_phones.make_stray, None, "stray"),
+    "arkitscenes": (made_phones.make_arkitscenes, None, "arkitscenes"),
     "record3d": (made_phones.make_record3d, None, "record3d"),
     "mkv": (made_kinect.make_small_mkv, "a.mkv", "azure-kinect"),
     "o3r": (made_ifm.make_o3r, "a.data", "ifm-o3r"),

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from tofuse.engine.geometry.quaternion import from_matrix
-from tofuse.engine.geometry.se3 import exp
+from tofuse.engine.geometry.se3 import exp, inverse
 from tofuse.formats.images.images import write_png
 
 WIDTH, HEIGHT = 32, 24  # with the aspect ratio of 1920 x 1440
@@ -80,6 +80,29 @@ def make_stray(folder: Path, *, lenses: bool = False) -> None:
     (folder / "imu.csv").write_text(
         "timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\n1, 0, -9.8, 0, 0, 0, 0.5\n"
     )
+
+
+def make_arkitscenes(folder: Path) -> None:
+    """With the file of one lens named a millisecond later, as it occurs in the data set."""
+    for name in ("lowres_depth", "lowres_wide", "lowres_wide_intrinsics", "confidence"):
+        (folder / name).mkdir(parents=True)
+    lines = []
+    for k in range(3):
+        name = f"41048190_{3418.328 + k / 10:.3f}"
+        write_png(folder / "lowres_depth" / f"{name}.png", millimetres(DEPTH[k]))
+        write_png(folder / "confidence" / f"{name}.png", CONFIDENCE[k])
+        write_png(folder / "lowres_wide" / f"{name}.png", color_image(k, WIDTH, HEIGHT))
+        lens = (
+            folder / "lowres_wide_intrinsics" / f"41048190_{3418.328 + k / 10 + k // 2 / 1e3:.3f}"
+        )
+        numbers = [(FX + k) / 60, (FX + k) / 60, (CX + 0.5) / 60 - 0.5, (CY + 0.5) / 60 - 0.5]
+        text = " ".join(map(str, (WIDTH, HEIGHT, *numbers)))
+        lens.with_name(f"{lens.name}.pincam").write_text(text)
+        T_camera_world = inverse(POSES[k])
+        turn = cv2.Rodrigues(T_camera_world[:3, :3])[0].ravel()
+        row = [3418.33 + k / 10, *turn.tolist(), *T_camera_world[:3, 3].tolist()]
+        lines.append(" ".join(map(repr, row)))
+    (folder / "lowres_wide.traj").write_text("\n".join(lines) + "\n")
 
 
 def exr_bytes(

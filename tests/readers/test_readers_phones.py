@@ -16,7 +16,9 @@ from phone_checks import check_frames, check_lens
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.quality.map_agreement import map_consistency
+from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.recordings.open import open_recording
 
 
@@ -91,6 +93,21 @@ def test_stray_with_video_and_lens_of_each_frame(tmp_path: Path) -> None:
     data = Path(path).read_bytes()
     Path(path).write_bytes(data[: len(data) // 2])
     assert any("colour is ignored" in line for line in open_recording(tmp_path / "scan").warnings)
+
+
+@pytest.mark.parametrize("place", ["41048190", "41048190/41048190_frames"])
+def test_arkitscenes(tmp_path: Path, place: str) -> None:
+    """Also in the layout of its subset with bounding boxes, beside a mesh."""
+    made.make_arkitscenes(tmp_path / place)
+    write_ply(tmp_path / "41048190" / "41048190_3dod_mesh.ply", GeometryRecord(np.ones((3, 3))))
+    recording = open_recording(tmp_path / "41048190")
+    assert recording.format == "arkitscenes"
+    np.testing.assert_allclose(recording.timestamps, [3418.328, 3418.428, 3418.528])
+    check_frames(recording)
+    for k, frame in enumerate(recording):
+        assert frame.color_image is not None
+        check_lens(frame, made.FX + k, made.CX, made.CY)
+    assert recording.warnings == []
 
 
 def test_record3d_folder(tmp_path: Path) -> None:

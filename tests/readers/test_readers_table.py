@@ -44,6 +44,7 @@ def digest(recording: Recording) -> list[float]:
 DIGESTS: dict[str, tuple[float, ...]] = {
     "3dscannerapp": (2301, 0.038234, 0.60273, 9.7493, 0, 85.385, 0.4, 9.1929),
     "stray": (2301, 0.038276, 0.60321, 9.7493, 0, 0, 0.033333, 9.1929),
+    "arkitscenes": (2301, 0.038234, 0.60273, 9.7493, 0, 255.35, 0.2, 9.1929),
     "record3d": (2301, 0.031023, 0.80159, 9.7562, 0, 256.32, 0.033333, 9.1929),
     "mkv": (1.8427e+05, -0.19698, -0.44597, 6.0053, 2000.8, 60.979, 0.033333, 0),
     "o3r": (642, -0.028973, 0.53476, 6.9903, 1.4191e+05, 0, 0.1, 0),
@@ -183,6 +184,9 @@ DAMAGED: list[tuple[str, Change, str | tuple[int, ...], str]] = [
     ("slam6d", put("scan000.pose", "1 2 3\n"), (), "scan000.pose"),
     ("3dscannerapp", put("frame_00001.json", '{"time": 1}'), (1,), "intrinsics: is missing"),
     ("stray", drop("camera_matrix.csv"), REFUSED, "camera_matrix.csv: is missing"),
+    ("arkitscenes", drop("lowres_wide_intrinsics/*.428.*"), (1,), "has no file in lowres_wide_in"),
+    ("arkitscenes", put("lowres_depth/a.png", b""), REFUSED, "name doesn't end with its time"),
+    ("arkitscenes", put("lowres_wide.traj", "1 2 3\n"), REFUSED, "lowres_wide.traj: is not lines"),
     ("r3d", cut(2000), REFUSED, "damaged archive"),
     ("polycam", put("keyframes/cameras/5000000.json", '{"fx": NaN}'), (0,), "fy: is missing"),
     ("polycam", drop("keyframes/images/5250000.jpg"), (), ONE_IMAGE),
