@@ -147,6 +147,28 @@ def test_map_coordinates_keep_millimetre_precision(tmp_path: Path) -> None:
     assert np.allclose(frame.points + frame.shift, POINTS + where, atol=2e-3)
 
 
+@pytest.mark.parametrize("kind", ["WKT", "GeoTIFF"])
+def test_las_in_feet_is_refused(tmp_path: Path, kind: str) -> None:
+    laspy = pytest.importorskip("laspy")
+    known = laspy.vlrs.known
+    for unit in ("metre", "US survey foot"):
+        data = laspy.LasData(laspy.LasHeader(version="1.2", point_format=2))
+        data.x, data.y, data.z = POINTS.T
+        if kind == "WKT":
+            system = f'PROJCS["x",GEOGCS["y",UNIT["degree",0.0174]],UNIT["{unit}",1.0]]'
+            data.header.vlrs.append(known.WktCoordinateSystemVlr(system))
+        else:
+            keys = struct.pack("<8H", 1, 1, 0, 1, 3076, 0, 1, 9001 if unit == "metre" else 9003)
+            record = laspy.VLR("LASF_Projection", 34735, "", keys)
+            data.header.vlrs.append(record)
+        data.write(tmp_path / "a.las")
+        if unit == "metre":
+            assert len(tofuse.open(tmp_path / "a.las")[0]) == 500
+        else:
+            with pytest.raises(InputError, match=r"a\.las: has coordinates in feet; convert"):
+                tofuse.open(tmp_path / "a.las")
+
+
 def test_las_with_excessive_point_count(tmp_path: Path) -> None:
     pytest.importorskip("laspy")
     write_las(tmp_path / "a.las", GeometryRecord(POINTS))

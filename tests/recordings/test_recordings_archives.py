@@ -46,6 +46,25 @@ def test_export_of_app_opens_as_it_is(make, inside: str, tmp_path: Path) -> None
     assert unzipped(path) == unzipped(path)
 
 
+def test_archive_of_windows_program(tmp_path: Path) -> None:
+    """Some separate folders by backslashes."""
+    made.make_scanner_app(tmp_path / "scan")
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        for file in (tmp_path / "scan").iterdir():
+            archive.writestr(f"Scan 1\\{file.name}", file.read_bytes())
+    assert len(open_recording(tmp_path / "a.zip")) == 3
+
+
+def test_archive_that_is_not_unpacked_is_named_so(tmp_path: Path) -> None:
+    made.make_scanner_app(tmp_path / "scan")
+    (tmp_path / "folder").mkdir()
+    zipped(tmp_path / "scan", tmp_path / "folder" / "scan.zip")
+    (tmp_path / "scan.tar.gz").write_bytes(b"\x1f\x8b")
+    for name in ("folder", "scan.tar.gz"):
+        with pytest.raises(InputError, match=r"is an archive, .* unpack any other"):
+            open_recording(tmp_path / name)
+
+
 def test_archive_of_single_file_is_that_file(tmp_path: Path) -> None:
     pytest.importorskip("lzfse")
     made.make_r3d(tmp_path / "scan.r3d")

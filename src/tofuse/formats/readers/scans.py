@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 from contextlib import closing
 from pathlib import Path
@@ -30,6 +31,9 @@ from tofuse.formats.sources import (
 MAX_POINTS = 100_000_000
 _E57 = b"ASTM-E57"
 _MAX_COMPRESSION = 1000  # of LAZ; scans reach 4 to 15
+# GeoTIFF's key of the unit of projected coordinates, its codes of feet, and their names in WKT.
+_LINEAR_UNIT, _FEET = 3076, {9002, 9003}
+_WKT_FEET = re.compile(r"UNIT\s*\[\s*\"[^\"]*(foot|feet|ft)", re.IGNORECASE)
 _COPY = "copy the file again, or export it again"
 
 
@@ -118,17 +122,35 @@ def _check_chunks(path: Path, header: Any) -> None:
         )
 
 
+def _check_unit(header: Any, path: Path) -> None:
+    """Refuse coordinates in feet, as the coordinate system of the file states them."""
+    with reading.library_errors(path, _COPY):
+        keys = [
+            key.value_offset
+            for record in header.vlrs
+            for key in getattr(record, "geo_keys", ())
+            if key.id == _LINEAR_UNIT
+        ]
+        text = " ".join(str(getattr(record, "string", "")) for record in header.vlrs)
+    if _FEET & set(keys) or _WKT_FEET.search(text):
+        raise InputError(
+            "has coordinates in feet",
+            where=path,
+            remedy="convert it to a coordinate system in metres, as by pdal or CloudCompare",
+        )
+
+
 def read_las(path: Path) -> Any:
     """Return the `laspy.LasData` of a file, whose header is checked first.
 
     Raises
     ------
     InputError
-        If it is damaged.
+        If it is damaged, or in feet.
     """
     import laspy
 
-    _las_header(path)
+    _check_unit(_las_header(path), path)
     with reading.library_errors(path, _COPY):
         return laspy.read(path)
 

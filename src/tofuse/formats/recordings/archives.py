@@ -72,6 +72,8 @@ def _checked(members: list[zipfile.ZipInfo], path: Path) -> list[zipfile.ZipInfo
         return InputError(problem, where=path, remedy=remedy)
 
     members = [m for m in members if not m.is_dir()]
+    for member in members:  # of programs on Windows
+        member.filename = member.filename.replace("\\", "/")
     members = [m for m in members if not set(PurePosixPath(m.filename).parts) & set(_OF_SYSTEMS)]
     if not members:
         raise refuse("is an empty archive", "pass a recording")
@@ -79,10 +81,10 @@ def _checked(members: list[zipfile.ZipInfo], path: Path) -> list[zipfile.ZipInfo
         raise refuse(f"contains {len(members):,} files")
     for member in members:
         name = member.filename
-        parts = PurePosixPath(name.replace("\\", "/")).parts
+        parts = PurePosixPath(name).parts
         if member.flag_bits & 1:
             raise refuse("is encrypted", "unpack it with its password, and pass the folder")
-        if name.startswith(("/", "\\")) or ".." in parts or ":" in parts[0]:
+        if name.startswith("/") or ".." in parts or ":" in parts[0]:
             raise refuse(f"contains a file outside of itself ({name!r})", "check where it is from")
         if stat.S_ISLNK(member.external_attr >> 16):
             raise refuse(f"contains a link ({name!r})")

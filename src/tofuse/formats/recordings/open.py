@@ -35,7 +35,16 @@ CLOSED = {
         "is of Kinect Studio, whose layout isn't published",
         "play it by Kinect Studio and save its depth images, or record by iai_kinect2",
     ),
+    **dict.fromkeys(
+        (".svo", ".svo2"),
+        (
+            "is of ZED's SDK, which alone reads it",
+            "export depth by it, and write that as .npz (docs/formats.md), or record ROS topics",
+        ),
+    ),
 }
+
+_ARCHIVES = {".zip", ".tar", ".gz", ".tgz", ".7z", ".rar"}
 
 # A single file of these, which contain a whole recording, is that of its folder.
 _CONTAINERS = (".bag", ".db3", ".mcap", ".mkv", ".sens", ".r3d", ".npz", ".h5", ".e57")
@@ -188,6 +197,12 @@ def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
     if not sniffs and (parts := _recordings_in(path)):
         return parts
     suffixes = {p.suffix.lower() for p in (children or [path]) if p.is_file()}
+    if suffixes and suffixes <= _ARCHIVES:
+        raise InputError(
+            "is an archive, or contains only that",
+            where=path,
+            remedy="pass a .zip itself, unpack any other",
+        )
     for suffix in suffixes & CLOSED.keys():
         problem, remedy = CLOSED[suffix]
         raise InputError(problem, where=path, remedy=remedy)
@@ -255,7 +270,7 @@ def _recordings_in(path: Path) -> list[_Located]:
         raise InputError(
             f"contains several recordings: {listed}",
             where=path,
-            remedy="pass one of them, or several in order",
+            remedy="pass one of them, or several in order (unpack an archive first)",
         )
     return [_Located(p, reader) for p in format_of]
 
