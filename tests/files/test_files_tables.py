@@ -62,6 +62,12 @@ def test_files_are_in_natural_order(tmp_path: Path) -> None:
     assert len(list_folder(tmp_path)) == 4
 
 
+def test_text_of_windows_is_read(tmp_path: Path) -> None:
+    for encoding in ("utf-8-sig", "utf-16"):
+        (tmp_path / "a.txt").write_bytes("1 2\r\n".encode(encoding))
+        np.testing.assert_array_equal(read_numbers(tmp_path / "a.txt"), [[1, 2]])
+
+
 def test_non_text_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_bytes(b"abc\xff\xfe\xff")
     with pytest.raises(InputError, match="byte 3"):

@@ -10,7 +10,6 @@ import numpy as np
 
 from made_phones import jpeg
 
-RNG = np.random.default_rng(60)
 # Intrinsics of a real device, relative to the size of the whole image.
 DEPTH_LENS = [
     0.51296979, 0.51692354, 0.49278089, 0.49290284, 0.54793977, -0.02097137, -0.00265223,
@@ -120,7 +119,7 @@ def make_mkv(
 
 def small_counts(count: int = 3) -> np.ndarray:
     """Depth in mm of the smallest mode."""
-    return RNG.integers(0, 4000, (count, 288, 320)).astype(np.uint16)
+    return np.random.default_rng(60).integers(0, 4000, (count, 288, 320)).astype(np.uint16)
 
 
 def make_small_mkv(path: Path) -> None:

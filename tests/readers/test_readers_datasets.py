@@ -247,6 +247,22 @@ def test_redwood_uses_what_recorders_of_open3d_state(tmp_path: Path) -> None:
         open_recording(tmp_path)
 
 
+def test_redwood_beside_other_json_files(tmp_path: Path) -> None:
+    """Open3D's viewer saves views, with the intrinsic matrix of its window."""
+    make_redwood(tmp_path)
+    (tmp_path / "trajectory.log").unlink()
+    matrix = [500.0, 0, 0, 0, 510.0, 0, 321.0, 241.0, 1]
+    camera = {"width": 640, "height": 480, "intrinsic_matrix": matrix}
+    (tmp_path / "intrinsic.json").write_text(json.dumps(camera))
+    window = {"class_name": "PinholeCameraParameters", "intrinsic": camera | {"width": 1920}}
+    (tmp_path / "ScreenCamera_2026-11-28.json").write_text(json.dumps(window))
+    (tmp_path / "._intrinsic.json").write_bytes(b"\0\5\26\7")
+    (tmp_path / "other.json").write_bytes(b"\xff\xff")
+    assert open_recording(tmp_path)[0].camera == Pinhole(640, 480, 500.0, 510.0, 321.0, 241.0)
+    with pytest.raises(InputError, match=r"not a recording .*; pass the recording's folder, "):
+        open_recording(tmp_path / "color")
+
+
 def test_redwood_colour_of_another_rate_and_numbering(tmp_path: Path) -> None:
     """By time if both are named by it, as in Redwood's data sets, or by equal names."""
     make_redwood(tmp_path)

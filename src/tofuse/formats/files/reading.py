@@ -215,14 +215,19 @@ def parse_toml(text: str, *, where: str | Path) -> dict[str, Any]:
 
 
 def read_text(path: str | Path, *, limit: int = MAX_TEXT_BYTES) -> str:
-    """Return the content of a UTF-8 file (a byte order mark is dropped); errors as `read_bytes`."""
+    """Return the content of a UTF-8 file, or UTF-16 with a byte order mark, which is dropped.
+
+    Errors as `read_bytes`.
+    """
+    data = read_bytes(path, limit=limit)
+    encoding = "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
     try:
-        return read_bytes(path, limit=limit).decode("utf-8-sig")
+        return data.decode(encoding)
     except UnicodeDecodeError as error:
         raise InputError(
             f"is not text (byte {error.start} is not UTF-8)",
             where=path,
-            remedy="check that it is the file you meant",
+            remedy="check that it is the file you meant, and save it as UTF-8",
         ) from error
 
 

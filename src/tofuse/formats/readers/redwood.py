@@ -87,15 +87,24 @@ class Redwood(Reader):
 
 def _camera_file(path: Path) -> Path | None:
     """The .json with an intrinsic_matrix, if there is one; InputError if several differ."""
-    files = [f for f in reading.files_with(path, ".json") if reading.is_file(f)]
-    cameras = [f for f in files if "intrinsic_matrix" in reading.read_text(f)]
-    if len({reading.read_text(f) for f in cameras}) > 1:
+    texts = {f: text for f in reading.files_with(path, ".json") if (text := _camera_text(f))}
+    if len(set(texts.values())) > 1:
         raise InputError(
-            f"has several cameras: {', '.join(f.name for f in cameras)}",
+            f"has several cameras: {', '.join(f.name for f in texts)}",
             where=path,
             remedy="keep one of them",
         )
-    return cameras[0] if cameras else None
+    return next(iter(texts), None)
+
+
+def _camera_text(file: Path) -> str | None:
+    """The text of a .json with an intrinsic_matrix of its own; None for views, or anything else."""
+    try:
+        text = reading.read_text(file)
+    except InputError:
+        return None
+    named = '"intrinsic_matrix"' in text
+    return text if named and "intrinsic_matrix" in reading.parse_json(text, file) else None
 
 
 @dataclass(frozen=True)

@@ -295,6 +295,9 @@ def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) ->
         return InputError("is empty", where=path, remedy="copy the file again")
     else:
         problem = f"is not a recording of a known format, but a {path.suffix!r} file"
+    folder = path.absolute().parent
+    if is_recording(folder):
+        return InputError(problem, where=path, remedy=f"pass the recording's folder, {folder}")
     return InputError(
         problem, where=path, remedy=f"{remedy}, or use --format ({', '.join(readers())})"
     )
