@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from made_dumps import pgm_bytes
 from made_recordings import (
     CAMERA,
     COUNTS,
@@ -26,7 +27,7 @@ from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry.se3 import exp
 from tofuse.engine.noise.model import family_of
 from tofuse.formats.geometry.ply import write_ply
-from tofuse.formats.images.images import write_png
+from tofuse.formats.images.images import read_image, write_png
 from tofuse.formats.poses.trajectory import write_tum
 from tofuse.formats.recordings.open import open_recording
 
@@ -187,6 +188,12 @@ def test_cameras_in_info_file(tmp_path: Path, place: str) -> None:
     assert set(np.unique(frame.color_image)) == {0, 77}  # occluded, or seen
     assert recording.metadata["sensor"] == "StructureSensor"
     assert recording.warnings == []
+    # 3RScan's depth is PGM.
+    for path in (tmp_path / place).glob("*.depth.png"):
+        counts = read_image(path)
+        path.with_suffix(".pgm").write_bytes(pgm_bytes(counts))
+        path.unlink()
+    np.testing.assert_array_equal(open_recording(tmp_path / place)[1].depth, frame.depth)
     info.write_text(INFO.replace("583 0", "wide 0"))
     with pytest.raises(InputError, match=r"info\.txt: m_calibrationDepthIntrinsic: is missing, or"):
         open_recording(tmp_path / place)

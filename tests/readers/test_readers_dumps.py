@@ -18,7 +18,7 @@ from posed_results import POSES as EXPORTED_POSES
 from tofuse.apps.export.exporting import export
 from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.formats.readers.hololens2 import parse_pgm
+from tofuse.formats.images.images import parse_image
 from tofuse.formats.recordings.open import open_recording
 
 
@@ -165,12 +165,12 @@ def test_incomplete_hololens(tmp_path: Path) -> None:
 
 def test_pgm() -> None:
     image = np.arange(6, dtype=np.uint16).reshape(2, 3) * 1000
-    np.testing.assert_array_equal(parse_pgm(made.pgm_bytes(image), "a.pgm"), image)
+    np.testing.assert_array_equal(parse_image(made.pgm_bytes(image), "a.pgm"), image)
     small = b"P5 # made by hand\n3 2\n# twice\n255\n" + bytes(range(6))
-    np.testing.assert_array_equal(parse_pgm(small, "a.pgm"), np.arange(6).reshape(2, 3))
+    np.testing.assert_array_equal(parse_image(small, "a.pgm"), np.arange(6).reshape(2, 3))
     for bad in (b"", b"P2\n1 1\n1\n1", b"P5\n0 2\n255\n", b"P5\n99999 99999\n255\n", small[:-1]):
         with pytest.raises(InputError, match=r"a\.pgm"):
-            parse_pgm(bad, "a.pgm")
+            parse_image(bad, "a.pgm")
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""PNG, JPEG, NumPy and raw images, checked before they are decoded.
+"""PNG, JPEG, PGM, NumPy and raw images, checked before they are decoded.
 
 OpenCV fills the missing part of a truncated file with zeros or grey, reports it at most on stderr,
 and allocates any size that a header declares. So the structure of a file is checked first.
@@ -6,6 +6,7 @@ and allocates any size that a header declares. So the structure of a file is che
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from collections.abc import Sequence
@@ -27,6 +28,8 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
 _COPY_AGAIN = "copy the file again"
 _NOT_SOF = {0xC4, 0xC8, 0xCC}
+_SPACE = rb"(?:\s+(?:#[^\n]*\n)?)+"
+_PGM = re.compile(rb"P5" + (_SPACE + rb"(\d{1,5})") * 3 + rb"\s")
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class ImageHeader:
 
 
 def read_header(path: str | Path) -> ImageHeader:
-    """Read size and type of a PNG, JPEG or .npy without decoding it.
+    """Read size and type of a PNG, JPEG, PGM or .npy without decoding it.
 
     Raises
     ------
@@ -67,8 +70,13 @@ def _header(data: bytes) -> ImageHeader:
         header = _png_header(data)
     elif data.startswith(b"\xff\xd8"):
         header = _jpeg_header(data)
+    elif pgm := _PGM.match(data):
+        width, height, max_value = (int(text) for text in pgm.groups())
+        if not 0 < max_value < 1 << 16:
+            raise InputError(f"declares values up to {max_value}")
+        header = ImageHeader("pgm", width, height, 1, 16 if max_value > 255 else 8)
     else:
-        problem = "is empty" if not data else "is neither a PNG nor a JPEG image"
+        problem = "is empty" if not data else "is neither a PNG, a JPEG nor a binary PGM image"
         raise InputError(problem)
     check_pixels(header.width, header.height)
     return header
@@ -165,7 +173,7 @@ def first_size(files: Sequence[Path]) -> tuple[int, int]:
 def read_image(
     path: str | Path, *, size: tuple[int, int] | None = None, dtype: str | None = None
 ) -> NDArray[Any]:
-    """Read a PNG or JPEG as it is stored: (H, W) grey, or (H, W, 3) RGB; uint8 or uint16.
+    """Read a PNG, JPEG or PGM as it is stored: (H, W) grey, or (H, W, 3) RGB; uint8 or uint16.
 
     Also the numbers (H, W) of an .npy file, which may have any type.
 
@@ -208,7 +216,7 @@ def parse_image(
     size: tuple[int, int] | None = None,
     dtype: str | None = None,
 ) -> NDArray[Any]:
-    """Decode a PNG or JPEG in memory; `path` names it in errors. See `read_image`."""
+    """Decode a PNG, JPEG or PGM in memory; `path` names it in errors. See `read_image`."""
     with reading.about(path, _COPY_AGAIN):
         return _parsed(data, size, dtype)
 
@@ -221,11 +229,24 @@ def _parsed(data: bytes, size: tuple[int, int] | None, dtype: str | None) -> NDA
             f"has {header.channels} channels of {header.bits} bits",
             remedy=f"store one channel of {dtype}",
         )
+    if header.format == "pgm":
+        return _pgm_pixels(data, header)
     if header.format == "png":
         _check_complete(data)
     elif data.rfind(b"\xff\xd9") < 0:
         raise InputError("is cut off before its end")
     return _decode(data, header)
+
+
+def _pgm_pixels(data: bytes, header: ImageHeader) -> NDArray[Any]:
+    match = _PGM.match(data)
+    assert match is not None
+    dtype = np.dtype(">u2" if header.bits == 16 else "u1")
+    count = header.width * header.height
+    if len(data) < match.end() + count * dtype.itemsize:
+        raise InputError("is cut off before its end")
+    image = np.frombuffer(data, dtype, count, match.end()).reshape(header.height, header.width)
+    return image.astype(dtype.newbyteorder("="))
 
 
 def _decode(data: bytes, header: ImageHeader) -> NDArray[Any]:

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float32, Float64, UInt8, UInt16
+from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
-from tofuse.formats.images import read_raw
+from tofuse.formats.images import parse_image, read_raw
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs
 
 # The streams by preference, with their ambiguity range in m.
@@ -140,7 +140,7 @@ class HoloLens2Source(FileSource):
         where = f"{path}: {tick}{'_ab' if bright else ''}.pgm"
         if size > _MAX_BYTES:
             raise InputError("is too large", where=where)
-        image = parse_pgm(reading.read_part(path, begin, size), where)
+        image = parse_image(reading.read_part(path, begin, size), where)
         if image.dtype != np.uint16 or min(image.shape) < 2:
             raise InputError("is not a 16-bit image", where=where)
         return image
@@ -203,34 +203,3 @@ def _rays(path: Path, shape: tuple[int, int]) -> Float32:
         rays = table[..., :2] / table[..., 2:]
         valid = np.isfinite(rays).all(-1) & (table[..., 2] > 0) & (np.abs(rays) < 1e4).all(-1)
     return np.where(valid[..., None], rays, np.nan).astype(np.float32)
-
-
-_SPACE = rb"(?:\s+(?:#[^\n]*\n)?)+"
-_HEADER = re.compile(rb"P5" + (_SPACE + rb"(\d{1,5})") * 3 + rb"\s")
-
-
-def parse_pgm(data: bytes, where: str | Path) -> UInt8 | UInt16:
-    """Decode (H, W) uint8 or uint16.
-
-    Raises
-    ------
-    InputError
-        Naming `where`, if it is not such an image, or is cut off.
-    """
-    with reading.about(where, "copy the file again"):
-        return _parsed(data)
-
-
-def _parsed(data: bytes) -> UInt8 | UInt16:
-    header = _HEADER.match(data)
-    if header is None:
-        raise InputError("is not a binary PGM image")
-    width, height, max_value = (int(text) for text in header.groups())
-    if not (width and height and 0 < max_value < 65536):
-        raise InputError(f"declares {width} x {height} pixels with values up to {max_value}")
-    dtype = np.dtype(">u2" if max_value > 255 else "u1")
-    size = width * height * dtype.itemsize
-    if len(data) < header.end() + size:
-        raise InputError("is cut off before its end")
-    image = np.frombuffer(data, dtype, width * height, header.end()).reshape(height, width)
-    return image.astype(dtype.newbyteorder("="))

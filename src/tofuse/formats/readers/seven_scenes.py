@@ -26,7 +26,7 @@ DEFAULT_CAMERA = Pinhole(*SIZE, 585.0, 585.0, 320.0, 240.0)
 _INTRINSICS, _INFO = "camera-intrinsics.txt", ("info.txt", "_info.txt")
 _INFO_LENS = "m_calibrationDepthIntrinsic"
 
-_DEPTH = re.compile(r"frame-([0-9]{1,9})\.depth\.png", re.IGNORECASE)
+_DEPTH = re.compile(r"frame-([0-9]{1,9})\.depth\.(?:png|pgm)", re.IGNORECASE)
 
 
 @part("reader", "7scenes", label="validated")
