@@ -449,6 +449,16 @@ def test_xyz(tmp_path: Path) -> None:
     assert frames[4].color[0].tolist() == [51, 51, 51]
 
 
+@pytest.mark.parametrize(
+    "head", ["X Y Z Nx Ny Nz\n", "x;y;z;nx;ny;nz\n", "20\n", "//X Y Z\n", "\n", ""]
+)
+def test_head_of_xyz_is_skipped(tmp_path: Path, head: str) -> None:
+    table = np.random.default_rng(6).normal(size=(20, 6)).round(6)
+    rows = "".join(" ".join(map(str, row)) + "\n" for row in table.tolist())
+    (tmp_path / "a.xyz").write_text(head + rows)
+    np.testing.assert_allclose(open_recording(tmp_path)[0].points, table[:, :3], rtol=1e-6)
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz"])
 def test_map_coordinates_keep_millimetre_precision(tmp_path: Path, suffix: str) -> None:
     """Each cloud has its shift; poses stay those of the files."""

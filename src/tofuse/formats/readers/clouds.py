@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -106,8 +107,9 @@ class XyzClouds(cloud_sequence.CloudReader):
 
 
 def xyz_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
-    """Read one file."""
-    table = tables.read_numbers(path)
+    """Read one file: lines of numbers, maybe after one with their count or with names."""
+    text = reading.read_text(path)
+    table = tables.parse_numbers(text, path, skip=int(_has_head(text)))
     if table.shape[1] < 3:
         raise InputError(f"has {table.shape[1]} numbers per line", where=path, remedy="write x y z")
     normals = color = None
@@ -121,6 +123,15 @@ def xyz_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
             color = columns.astype(np.uint8)
     cloud = GeometryRecord(table[:, :3], None, normals, color, scalars=_fourth(table))
     return cloud_frames.cloud_frame(index, timestamp, cloud)
+
+
+def _has_head(text: str) -> bool:
+    """Whether the first line is a number of points, or names of columns."""
+    cells = text.split("\n", 1)[0].replace(",", " ").replace(";", " ").split()
+    with suppress(IndexError, ValueError):
+        float(cells[0])
+        return len(cells) == 1
+    return True
 
 
 def _fourth(table: Float64) -> dict[str, Float32]:

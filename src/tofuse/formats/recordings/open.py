@@ -296,7 +296,7 @@ def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) ->
     else:
         problem = f"is not a recording of a known format, but a {path.suffix!r} file"
     folder = path.absolute().parent
-    if is_recording(folder):
+    if any(sniff.confidence > Sniff.CERTAIN for sniff in _sniff(folder).values()):
         return InputError(problem, where=path, remedy=f"pass the recording's folder, {folder}")
     return InputError(
         problem, where=path, remedy=f"{remedy}, or use --format ({', '.join(readers())})"
