@@ -83,6 +83,14 @@ def test_lens_of_rectified_images(tmp_path: Path, topic: str, rectified: bool) -
     assert camera == (Pinhole(16, 12, 18.0, 19.0, 7.25, 5.25) if rectified else raw)
 
 
+def test_depth_of_depthai(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "mcap")
+    bag.info("/oak/stereo/camera_info")
+    bag.image("/oak/stereo/image_raw", 10, COUNTS[0], "16UC1")
+    frame = open_recording(bag.close())[0]
+    np.testing.assert_allclose(frame.z, COUNTS[0] / 1000, rtol=1e-6)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_file_of_bag_alone_in_a_folder(tmp_path: Path, kind: str) -> None:
     """Copied without the metadata.yaml of ROS 2, or into a folder with notes."""

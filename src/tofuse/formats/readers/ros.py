@@ -140,7 +140,8 @@ class RosSource(bags.BagSource):
         raise InputError(
             f"has no topic of depth images or clouds (there are: {topics[:300] or 'none'})",
             where=self.path,
-            remedy="record 16UC1 or 32FC1 images with camera_info, or PointCloud2",
+            remedy="record 16UC1 or 32FC1 images with camera_info, or PointCloud2; if depth has "
+            "another name, choose it with --topic",
         )
 
     def _encoding(self, connection: Any) -> str:
@@ -310,6 +311,7 @@ def _rank(connection: Any) -> int | None:
         return 1 if registered else 0
     if kind == COMPRESSED and topic.endswith("compresseddepth"):
         return 2
-    if kind == IMAGE and any(keyword in topic for keyword in ("distance", "range")):
+    # DepthAI's driver calls its depth /oak/stereo/image_raw.
+    if kind == IMAGE and any(word in topic for word in ("distance", "range", "/stereo/image")):
         return 3
     return 4 if kind == CLOUD else None
