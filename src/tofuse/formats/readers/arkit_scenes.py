@@ -92,7 +92,10 @@ def _lens(file: Path, lens: Path | None, size: tuple[int, int]) -> Pinhole:
 def _read_poses(path: Path) -> tuple[Float64, Float64]:
     """Times (N,) and T_world_camera (N, 4, 4) of lines "t rx ry rz x y z" of T_camera_world."""
     table = tables.read_numbers(path)
-    if not len(table) or table.shape[1] != 7 or not np.isfinite(table).all():
-        raise InputError("is not lines of 7 numbers", where=path, remedy="download it again")
+    plausible = np.abs(table) < se3.MAX_COORDINATE_M  # false for NaN, too
+    if not len(table) or table.shape[1] != 7 or not plausible.all():
+        raise InputError(
+            "is not lines of 7 plausible numbers", where=path, remedy="download it again"
+        )
     rows = zip(se3.so3_exp(table[:, 1:4]), table[:, 4:], strict=True)
     return table[:, 0], np.stack([se3.inverse(se3.pose(R, t)) for R, t in rows])

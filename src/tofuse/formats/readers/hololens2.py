@@ -198,8 +198,8 @@ def _images(folder: Path, stream: str) -> tuple[_Images, bool]:
 
 def _rays(path: Path, shape: tuple[int, int]) -> Float32:
     """Rays (H, W, 2) from a table of unit vectors; NaN where undefined."""
-    table = read_raw(path, "3<f4", (shape[1], shape[0]), _REMEDY).astype(float)
     with np.errstate(all="ignore"):
+        table = read_raw(path, "3<f4", (shape[1], shape[0]), _REMEDY).astype(float)
         rays = table[..., :2] / table[..., 2:]
         valid = np.isfinite(rays).all(-1) & (table[..., 2] > 0) & (np.abs(rays) < 1e4).all(-1)
     return np.where(valid[..., None], rays, np.nan).astype(np.float32)

@@ -11,9 +11,10 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
+from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading
-from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, pixels
 
 FRAME_RATE_HZ = 32.0
 # Modulated at 30 MHz, the factory default.
@@ -102,7 +103,7 @@ class Sr4000Source(FileSource):
         path = self.files[index]
         blocks = _read_blocks(path)
         z = blocks["z"]
-        valid = np.isfinite(z) & (z >= NEAREST_M)
+        valid = (z >= NEAREST_M) & (z < se3.MAX_COORDINATE_M)  # false for NaN, too
         valid &= np.isfinite(blocks["x"]) & np.isfinite(blocks["y"])
         if valid.sum() < 16:
             raise InputError("has no valid distances", where=path)
@@ -117,9 +118,7 @@ class Sr4000Source(FileSource):
             index,
             depth.astype(np.float32),
             camera=RayTable(rays.astype(np.float32)),
-            amplitude_image=None
-            if amplitude is None
-            else np.nan_to_num(amplitude).astype(np.float32),
+            amplitude_image=None if amplitude is None else pixels.finite_float32(amplitude),
             confidence_image=confidence,
         )
 

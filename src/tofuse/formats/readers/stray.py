@@ -131,13 +131,16 @@ class StraySource(phones.PhoneSource):
             )
         rows = {int(n): k for k, n in enumerate(columns["frame"]) if np.isfinite(n)}
         row = np.array([rows.get(number, -1) for number in self.numbers])
+        nothing = InputError(
+            "has no timestamp of any image in depth/", where=path, remedy="copy it again"
+        )
+        if not rows:
+            raise nothing
         # A non-finite value counts as a missing row.
         times = np.where(row < 0, np.nan, columns["timestamp"][row])
         valid = np.isfinite(times)
         if not valid.any():
-            raise InputError(
-                "has no timestamp of any image in depth/", where=path, remedy="copy it again"
-            )
+            raise nothing
         if not valid.all():
             self.warnings.append(f"{path}: {int((~valid).sum())} frames have no row: interpolated")
         self.timestamps = inputs.interpolated(times)
