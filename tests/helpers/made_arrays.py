@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ POSES = exp(RNG.normal(size=(3, 6)))
 
 
 def arrays(**changes: Any) -> dict[str, Any]:
+    rng = copy.deepcopy(RNG)  # the same in every test
     out: dict[str, Any] = {
         "depth": COUNTS,
         "depth_unit_m": 0.001,
@@ -26,10 +28,10 @@ def arrays(**changes: Any) -> dict[str, Any]:
         "K": K,
         "distortion": np.array([0.1, -0.05]),
         "timestamps": np.array([5.0, 5.1, 5.3]),
-        "amplitude": RNG.uniform(1, 100, COUNTS.shape).astype(np.float32),
-        "confidence": RNG.integers(0, 8, COUNTS.shape).astype(np.uint8),
-        "sigma": RNG.uniform(0.001, 0.1, COUNTS.shape),
-        "color": RNG.integers(0, 256, (*COUNTS.shape, 3)).astype(np.uint8),
+        "amplitude": rng.uniform(1, 100, COUNTS.shape).astype(np.float32),
+        "confidence": rng.integers(0, 8, COUNTS.shape).astype(np.uint8),
+        "sigma": rng.uniform(0.001, 0.1, COUNTS.shape),
+        "color": rng.integers(0, 256, (*COUNTS.shape, 3)).astype(np.uint8),
         "reference": POSES,
         "odometry": POSES,
         "sensor": "My camera (ToF)",

@@ -66,6 +66,14 @@ def test_folder_with_single_recording_stands_for_it(tmp_path: Path) -> None:
     (tmp_path / "native" / "part1" / "noise.json").write_text("{}")
     with pytest.raises(InputError, match=r"noise\.json"):
         open_recording(tmp_path / "native")
+    # A mesh of the scene beside the folder of its frames, as in 3RScan and 12-Scenes.
+    (tmp_path / "3rscan").mkdir()
+    write_ply(tmp_path / "3rscan" / "mesh.ply", GeometryRecord(np.ones((3, 3))))
+    make_scanner_app(tmp_path / "3rscan" / "sequence")
+    with pytest.raises(InputError, match=r"and a recording in sequence/; pass .*--format ply"):
+        open_recording(tmp_path / "3rscan")
+    assert open_recording(tmp_path / "3rscan", format="ply").format == "ply"
+    assert len(open_recording(tmp_path / "3rscan", format="3dscannerapp")) == 3
     # Clouds in a folder may as well be a model beside images of an unknown format.
     (tmp_path / "unknown" / "mesh").mkdir(parents=True)
     write_ply(tmp_path / "unknown" / "mesh" / "0.ply", GeometryRecord(np.ones((3, 3))))

@@ -186,7 +186,16 @@ def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
         n: sniff for n, sniff in sniffs.items() if sniff.confidence >= max(best, Sniff.CERTAIN)
     }
     if len(confident) == 1:
-        return [_Located(path, readers()[next(iter(confident))])]
+        name, sniff = next(iter(confident.items()))
+        # Beside the frames, a model is no scan.
+        inner = [p for p in _folders_in(path) if _is_sure(p)] if best <= Sniff.CERTAIN else []
+        if inner:
+            raise InputError(
+                f"has {sniff.evidence}, and a recording in {inner[0].name}/",
+                where=path,
+                remedy=f"pass {inner[0]}, or use --format {name}",
+            )
+        return [_Located(path, readers()[name])]
     if len(confident) > 1:
         evidence = "; ".join(f"{name}: {sniff.evidence}" for name, sniff in confident.items())
         raise InputError(
@@ -218,9 +227,9 @@ def _resolve_as(path: Path, format: str) -> list[_Located]:  # noqa: A002
             remedy=f"use one of {', '.join(choices)}",
         )
     reader = choices[format]
-    if reader.joinable and path.is_dir() and _sniff_as(reader, path) is None:
+    if path.is_dir() and _sniff_as(reader, path) is None:
         parts = [p for p in _folders_in(path) if _sniff_as(reader, p) is not None]
-        if parts:
+        if parts and (reader.joinable or len(parts) == 1):
             return [_Located(p, reader) for p in parts]
     return [_Located(path, reader)]
 
@@ -241,6 +250,11 @@ def _sniff_as(reader: Reader, path: Path) -> Sniff | None:
 def _sniff(path: Path) -> dict[str, Sniff]:
     sniffs = {name: _sniff_as(reader, path) for name, reader in readers().items()}
     return {name: sniff for name, sniff in sniffs.items() if sniff is not None}
+
+
+def _is_sure(path: Path) -> bool:
+    """Whether a path has names and contents that only one format has, other than clouds."""
+    return any(sniff.confidence > Sniff.CERTAIN for sniff in _sniff(path).values())
 
 
 def is_recording(path: Path) -> bool:
@@ -296,7 +310,7 @@ def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) ->
     else:
         problem = f"is not a recording of a known format, but a {path.suffix!r} file"
     folder = path.absolute().parent
-    if any(sniff.confidence > Sniff.CERTAIN for sniff in _sniff(folder).values()):
+    if _is_sure(folder):
         return InputError(problem, where=path, remedy=f"pass the recording's folder, {folder}")
     return InputError(
         problem, where=path, remedy=f"{remedy}, or use --format ({', '.join(readers())})"
