@@ -218,7 +218,7 @@ def test_missing_command_prints_help(words, capsys) -> None:
 
 CONFIGS: dict[str, tuple[str, tuple[str, ...]]] = {
     "bad toml": ("filters = [", ("is not TOML",)),
-    "not text": ("\xff\xfe", ("is not text",)),
+    "not text": ("\xff\xff", ("is not text",)),
     "unknown nested option": (
         "[odometry.registration]\nresolutoin = 1",
         ("odometry.registration", "'resolutoin'", "'resolution'"),
