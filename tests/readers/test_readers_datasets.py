@@ -434,6 +434,8 @@ def test_xyz(tmp_path: Path) -> None:
         "c.xyz": np.c_[points, unit],
         "d.xyz": np.c_[points, np.tile([10, 20, 30], (20, 1))],
         "e.xyzrgb": np.c_[points, np.full((20, 3), 0.2)],
+        "f.asc": points,
+        "g.pts": np.c_[points, np.arange(20) - 40, np.tile([10, 20, 30], (20, 1))],
     }
     for name, table in files.items():
         np.savetxt(tmp_path / name, table)
@@ -447,6 +449,7 @@ def test_xyz(tmp_path: Path) -> None:
     np.testing.assert_allclose(frames[2].normals, unit, rtol=1e-6)
     assert frames[3].color[0].tolist() == [10, 20, 30]
     assert frames[4].color[0].tolist() == [51, 51, 51]
+    assert frames[6].color[0].tolist() == [10, 20, 30]
 
 
 @pytest.mark.parametrize(

@@ -87,16 +87,16 @@ def _image(pcd: Pcd) -> Float32:
     return cloud_frames.to_float32(pcd.cloud.points).reshape(pcd.height, pcd.width, 3)
 
 
-_SUFFIXES = (".xyz", ".xyzn", ".xyzrgb")
+_SUFFIXES = (".xyz", ".xyzn", ".xyzrgb", ".asc", ".pts")
 
 
 @part("reader", "xyz")
 class XyzClouds(cloud_sequence.CloudReader):
-    """A .xyz, .xyzn or .xyzrgb file, or a folder of them; metres.
+    """A .xyz, .xyzn, .xyzrgb, .asc or .pts file, or a folder of them; metres.
 
-    The fourth column of four is an amplitude. Columns four to six are normals in .xyzn, and where
-    all have length 1; colours in .xyzrgb (0 to 1), and where all are integers up to 255. Other
-    columns are ignored.
+    The fourth column of four is an amplitude. Columns four to six (of seven in .pts, after the
+    intensity, five to seven) are normals in .xyzn, and where all have length 1; colours in .xyzrgb
+    (0 to 1), and where all are integers up to 255. Other columns are ignored.
     """
 
     suffixes = _SUFFIXES
@@ -114,7 +114,8 @@ def xyz_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
         raise InputError(f"has {table.shape[1]} numbers per line", where=path, remedy="write x y z")
     normals = color = None
     if table.shape[1] >= 6:
-        columns = table[:, 3:6]
+        first = 4 if path.suffix.lower() == ".pts" and table.shape[1] == 7 else 3
+        columns = table[:, first : first + 3]
         if path.suffix.lower() == ".xyzrgb":
             color = np.clip(np.rint(np.nan_to_num(columns) * 255), 0, 255).astype(np.uint8)
         elif path.suffix.lower() == ".xyzn" or _are_unit(columns):
