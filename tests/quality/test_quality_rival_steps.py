@@ -8,6 +8,8 @@ from tests.helpers.made_rooms import CAMERA, at, seen, surface
 
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
+from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.quality.rival_steps import ambiguous_frames
 from tofuse.engine.stored_views.view_store import PosedView
 from tofuse.engine.tracking.motion import FrameTime
@@ -21,6 +23,12 @@ def tiles(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return 0.02 * (np.sin(2 * np.pi * x / PERIOD) + np.cos(2 * np.pi * y / PERIOD))
 
 
+def blocks(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The height of blocks with steep sides, which repeat themselves as the tiles do."""
+    x, y = np.sin(2 * np.pi * x / PERIOD), np.cos(2 * np.pi * y / PERIOD)
+    return 0.02 * np.tanh(3 * x) * np.tanh(3 * y)
+
+
 def relief(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """The height of a floor that never repeats itself."""
     return 0.02 * (np.sin(9 * x + 3 * y**2) + np.cos(8 * y + 4 * x**2))
@@ -31,11 +39,11 @@ def flat(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return 0.0 * x
 
 
-def floor_from_above(height, k: int, noise: float = 0.001) -> RangeFrame:
+def floor_from_above(height, k: int, noise: float = 0.001, step=STEP) -> RangeFrame:
     """The k-th view of a floor 1.5 m away, a step further each time."""
     rays = CAMERA.rays()
     z = np.full((CAMERA.height, CAMERA.width), 1.5)
-    origin = k * np.array(STEP)
+    origin = k * np.array(step)
     for _ in range(30):
         z = 1.5 - height(*(rays * z[..., None] + origin[:2]).transpose(2, 0, 1))
     z += noise * np.random.default_rng(k).standard_normal(z.shape)
@@ -57,6 +65,17 @@ def above(height, seconds: float, count: int = 3) -> tuple[int, ...]:
 def test_floor_of_tiles_is_ambiguous_where_a_step_by_a_tile_is_possible() -> None:
     assert above(tiles, 0.5) == (1, 2)
     assert above(tiles, 0.1) == ()  # 3 m/s would be necessary
+
+
+@pytest.mark.parametrize("height", [tiles, blocks])
+def test_camera_that_seems_to_stand_still_may_have_moved_by_a_period(height) -> None:
+    mapper = Mapper(from_method("default"), threads=1)
+    for k in range(6):
+        mapper.push(floor_from_above(height, k, step=(PERIOD, 0.0, 0.0)))
+    result = mapper.finish()
+    assert np.linalg.norm(result.trajectory[-1][:3, 3]) < 0.01
+    assert "ambiguous_steps" in [reason.code for reason in result.diagnostics.reasons]
+    assert np.isinf(result.diagnostics.accuracy.position_m)
 
 
 @pytest.mark.parametrize("height", [relief, flat])

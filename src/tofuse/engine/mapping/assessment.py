@@ -305,7 +305,11 @@ class Assessment:
             return ()
         poses = dict(zip(graph.ids.tolist(), graph.poses, strict=True))
         moments = [FrameTime(e.record.index, e.record.timestamp) for e in posed]
-        return ambiguous_frames(self.observations.views.of(poses), poses, moments)
+        views, newest = self.observations.views.of(poses), self.observations.newest
+        # A camera that seems to stand still has one stored view; it may move on by a period.
+        if newest is not None and newest.index in poses.keys() - {view.index for view in views}:
+            views = [*views, newest]
+        return ambiguous_frames(views, poses, moments)
 
     def _checked_images(self, graph: PoseGraph) -> tuple[list[RangeFrame], Intp]:
         """Return the images for the final comparison, and their positions in the graph."""

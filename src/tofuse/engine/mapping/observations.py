@@ -17,7 +17,7 @@ from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping.config import Config, checked_bytes, views_bytes
 from tofuse.engine.mapping.preparation import FilteredFrame
 from tofuse.engine.quality import cross_view_agreement, frame_samples
-from tofuse.engine.stored_views import Spacing, Spilled, ViewStore
+from tofuse.engine.stored_views import PosedView, Spacing, Spilled, ViewStore
 from tofuse.engine.tracking import Step
 from tofuse.engine.views import PreparedView
 
@@ -53,6 +53,8 @@ class Observations:
         Ambiguity range of the camera, if known.
     samples
         Some frames for the report.
+    newest
+        The last posed view, which `views` may not have, as tracked.
     """
 
     def __init__(
@@ -65,6 +67,7 @@ class Observations:
         )
         self.loops = config.loops.start(seed, prior_loops, self.views, config.search)
         self.samples = frame_samples.FrameSamples()
+        self.newest: PosedView[PreparedView] | None = None
         self.refiner = config.refinement.start(self.views)
         self.model = ModelBuilder(config.fusion, surface=surface)
         self._places = Spacing(views_per_place=_VIEWS_PER_PLACE).places()
@@ -92,6 +95,7 @@ class Observations:
             self.ambiguity_m = filtered.corrected.ambiguity_m
         if step.surface is not None:
             self.views.push(step.surface, T, step.component, _reduced)
+            self.newest = PosedView(step.surface, T, step.component)
         view = filtered.for_model
         if self._needs_points:
             view = as_cloud(view, _MAX_POINTS)
