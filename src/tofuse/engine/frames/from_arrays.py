@@ -59,7 +59,7 @@ def from_arrays(
     amplitude
         (N, H, W) counts, of the kind `amplitude_kind`.
     confidence
-        (N, H, W) uint8, higher is better.
+        (N, H, W) uint8, higher is better, 0 where nothing was measured.
     timestamps
         (N,) s, or datetime64 or timedelta64; 30 images per second unless given.
     reference

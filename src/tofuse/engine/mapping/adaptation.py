@@ -126,17 +126,30 @@ def with_recording_defaults(config: Config, recording: Recording) -> Config:
         for c in config.corrections
     )
     config = replace(config, corrections=corrections)
-    max_confidence = recording.metadata.get("confidence_max")
-    if not isinstance(max_confidence, int | float) or not 1 <= max_confidence <= 255:
+    highest = _highest_confidence(recording)
+    if highest is None:
         return config
-    scaled = (
-        tuple(
-            f.on_scale(round(max_confidence)) if isinstance(f, Confidence) else f for f in filters
-        )
-        for filters in (config.filters, config.model_filters)
-    )
-    filters, model_filters = scaled
+
+    def on_scale(filters: tuple[Filter, ...]) -> tuple[Filter, ...]:
+        return tuple(f.on_scale(highest) if isinstance(f, Confidence) else f for f in filters)
+
+    filters, model_filters = on_scale(config.filters), on_scale(config.model_filters)
     return replace(config, filters=filters, model_filters=model_filters)
+
+
+def _highest_confidence(recording: Recording) -> int | None:
+    """Return the highest level of confidence, as stated or seen; None: the filters' own."""
+    stated = recording.metadata.get("confidence_max")
+    if isinstance(stated, int | float) and 1 <= stated <= 255:
+        return round(stated)
+    first = recording.first_readable()
+    if not isinstance(first, RangeFrame) or first.confidence_image is None:
+        return None
+    frames = (f for f in recording.readable(_SAMPLE_FRAMES) if isinstance(f, RangeFrame))
+    images = [f.confidence_image for f in frames if f.confidence_image is not None]
+    seen = max((int(image.max()) for image in images), default=0)
+    # Cameras with fewer levels would have no point left; with more, good levels may be low ones.
+    return seen if 0 < seen < Confidence().highest else None
 
 
 def _noise_model(recording: Recording) -> NoiseModel | None:
