@@ -220,7 +220,7 @@ def print_fit(data: Path, max_pairs: int) -> None:
         print("; ".join(f"{f} {k}" for f, k in zip(families, factors[1:], strict=True)))
     print("\nnumber of surfaces that leads are reduced for, and log-likelihood of the left out")
     for few in _FEW:
-        with mock.patch.object(pose_probability, "_FEW_SURFACES", few):
+        with mock.patch.object(pose_probability, "FEW_SURFACES", few):
             rows = _left_out(_Samples.of(found, searched=True)).values()
         p, right = np.concatenate(list(rows)).T
         likelihood = np.log(np.where(right > 0, p, 1 - p).clip(_LEAST)).mean()

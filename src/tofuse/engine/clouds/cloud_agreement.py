@@ -58,6 +58,11 @@ class CloudAgreement(pair_agreement.Agreement):
     surfaces: float = 0.0
     near_surfaces: float = 0.0
 
+    @property
+    def coincidence(self) -> float:
+        """Fraction of the surfaces near each other that coincide."""
+        return self.surfaces / max(self.near_surfaces, 1e-9)
+
 
 @dataclass(frozen=True, eq=False)
 class CloudMap:

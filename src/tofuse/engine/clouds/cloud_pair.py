@@ -27,6 +27,7 @@ from tofuse.engine.clouds.cloud_agreement import (
 )
 from tofuse.engine.clouds.cloud_uncertainty import cloud_information, cloud_unobservable
 from tofuse.engine.clouds.fpfh import MATCH_WEIGHT, Candidates, candidates, log_matches
+from tofuse.engine.clouds.repetition import shifts
 from tofuse.engine.clouds.robust_motion import are_distinct
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame
@@ -175,7 +176,7 @@ class _CloudViews:
     ) -> pose_probability.CloudEvidence:
         """Return the evidence for a pose."""
         agreement = pose.agreement
-        most = max((rival.agreement.surfaces for rival in rivals), default=0.0)
+        most = max((_surfaces_of(rival.agreement, agreement) for rival in rivals), default=0.0)
         return pose_probability.CloudEvidence(
             agreement.support,
             agreement.contradiction,
@@ -325,7 +326,8 @@ def _best(
     """
     poses = _ranked(poses, found)
     if guess is None:
-        poses = _ranked([*poses, *_turned(views, poses[0])], found)
+        moved = *_turned(views, poses[0]), *_shifted(views, poses[0])
+        poses = _ranked([*poses, *moved], found)
     best = poses[0]
     if guess is not None:
         tied = [p for p in poses if p.score >= best.score - _MIN_LEAD]
@@ -478,6 +480,33 @@ def _turned(views: _CloudViews, pose: _Pose) -> list[_Pose]:
     turned = [views.evaluated(pose.T_target_source @ se3.about(centre, se3.exp(w))) for w in turns]
     least = _MIN_TURNED_OVERLAP * pose.agreement.overlap
     return [views.refined(p.T_target_source) for p in turned if p.agreement.overlap > least]
+
+
+def _shifted(views: _CloudViews, pose: _Pose) -> list[_Pose]:
+    """Return a pose after the translations at which a repeated structure fits as well."""
+    T, distinct_m = pose.T_target_source, _DISTINCT * views.size
+    found = shifts(views.source_map, views.target_map, T, distinct_m)
+    poses = [views.refined(se3.translation(shift) @ T) for shift in found]
+    return [shifted for shifted in poses if _fits_as_well(shifted.agreement, pose.agreement)]
+
+
+def _fits_as_well(rival: CloudAgreement, agreement: CloudAgreement) -> bool:
+    """Whether as large a fraction of the surfaces that are near each other coincides."""
+    return rival.coincidence >= agreement.coincidence - _MAX_SCORE_LOSS
+
+
+def _surfaces_of(rival: CloudAgreement, agreement: CloudAgreement) -> float:
+    """Return the surfaces that coincide at a rival pose.
+
+    Where a structure repeats, the clouds fit as well one repetition further, only over less of it.
+    That less overlaps is no evidence against that pose: its surfaces are counted as if as many were
+    near each other. A fraction of few surfaces may be chance, and is taken for a smaller one.
+    """
+    if not _fits_as_well(rival, agreement):
+        return rival.surfaces
+    few = pose_probability.FEW_SURFACES
+    nearby = min(rival.near_surfaces, agreement.near_surfaces) + few
+    return rival.surfaces * (agreement.near_surfaces + few) / nearby
 
 
 def symmetries(view: Frame) -> Float64:

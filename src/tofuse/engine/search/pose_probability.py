@@ -44,7 +44,7 @@ class ProbabilityModel:
 IMAGES = ProbabilityModel(search=(0.34, 6.17, -6.40, -4.21), local=(0.55, 7.01, -6.02))
 # Contradiction of clouds beyond which more is no stronger evidence, and the number of distinct
 # surfaces by which that near each other is increased: a lead among few surfaces may be chance.
-_MUCH_CONTRADICTION, _FEW_SURFACES = 0.05, 50.0
+_MUCH_CONTRADICTION, FEW_SURFACES = 0.05, 50.0
 # Of searched poses: fitted to 446 of clouds, equal in weight by the square root of their number of
 # a kind (clips, views and scans of simulated flats; a dragon; lasers; cameras; random boxes;
 # symmetric bodies), where right poses of a laser counted as wrong. So its log odds were scaled by
@@ -155,6 +155,14 @@ class PoseEvidence:
         """Return the reason why the pose is rejected; empty if it is accepted."""
         if self.probability >= ACCEPTED:
             return ""
+        return "; ".join(self.problems) or (
+            f"the probability that the pose is right is {self.probability:.0%}, below "
+            f"{ACCEPTED:.0%}"
+        )
+
+    @property
+    def problems(self) -> list[str]:
+        """What is unusual of a right pose, in words."""
         problems = []
         if self.support < _MIN_SUPPORT:
             problems.append(f"only {self.support:.0%} of the points of both views support the pose")
@@ -170,10 +178,7 @@ class PoseEvidence:
         if self.degenerate:
             plural = "direction is" if self.degenerate == 1 else "directions are"
             problems.append(f"{self.degenerate} {plural} degenerate")
-        return "; ".join(problems) or (
-            f"the probability that the pose is right is {self.probability:.0%}, below "
-            f"{ACCEPTED:.0%}"
-        )
+        return problems
 
 
 @dataclass(frozen=True)
@@ -183,7 +188,8 @@ class CloudEvidence(PoseEvidence):
     Attributes
     ----------
     surface_lead
-        Number of distinct surfaces that coincide, less that of the best rival.
+        Number of distinct surfaces that coincide, less that of the best rival; of one at which as
+        large a fraction coincides, less the number that would if as many were near each other.
     near_surfaces
         Number of distinct surfaces near each other, whether or not they coincide.
     free_space
@@ -202,11 +208,21 @@ class CloudEvidence(PoseEvidence):
         directions leave none, as poses along them fit as well. What cannot be contradicted, for
         want of free space, is less certain.
         """
-        lead = 0.0
-        if not self.degenerate:
-            lead = max(self.surface_lead, 0.0) / (self.near_surfaces + _FEW_SURFACES)
+        lead = 0.0 if self.degenerate else self._relative_lead
         contradiction = min(self.contradiction / _MUCH_CONTRADICTION, 1.0)
         return np.array([1, np.sqrt(lead), not self.free_space, contradiction])
+
+    @property
+    def _relative_lead(self) -> float:
+        return max(self.surface_lead, 0.0) / (self.near_surfaces + FEW_SURFACES)
+
+    @property
+    def problems(self) -> list[str]:
+        """See `PoseEvidence.problems`; also that a structure repeats."""
+        problems = super().problems
+        if (self.margin or 0.0) >= MIN_LEAD > self._relative_lead and not self.degenerate:
+            problems.append("in another pose distinct surfaces coincide nearly as well")
+        return problems
 
     @property
     def remedies(self) -> tuple[str, ...]:
