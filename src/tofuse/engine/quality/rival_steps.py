@@ -38,10 +38,11 @@ _FINE = projective.ProjectiveOptions(
 # Number of starts that are aligned finely: those that fit best.
 _MAX_FINE = 4
 # A rival sees this fraction of the view at least, and its score per point that it sees is lower by
-# this fraction at most. The step by no period at all scores up to 8 % higher than one by a period,
-# as the same pixels see the same edges; where nothing repeats itself, rivals lose more than twice
-# that, or see too little.
-_MIN_OVERLAP, _EQUAL = 0.5, 0.1
+# this fraction at most: the scores of right poses differ by as much.
+_MIN_OVERLAP, _EQUAL = 0.5, 0.03
+# If the camera seems to stand still, by at most so many pixels, the same pixels see the same edges,
+# and its pose scores up to 8 % higher than one further by a period.
+_STILL, _EQUAL_IF_STILL = 0.5, 0.1
 
 
 def ambiguous_frames(
@@ -98,13 +99,16 @@ def has_rival(
         return bool(DISTINCT_M < np.linalg.norm(shift) < reach)
 
     (own,) = aligned([T_earlier_later], _FINE)
+    pixel = float(np.nanmedian(np.abs(np.diff(later.rays[..., 0], axis=1))))
+    moved = np.linalg.norm(T_earlier_later[:3, 3]) / later.depth + se3.angle(T_earlier_later)
+    equal = _EQUAL_IF_STILL if moved < _STILL * pixel else _EQUAL
     offsets = reach * np.outer(_DISTANCES, _DIRECTIONS).ravel()
     starts = [T_earlier_later @ se3.translation((d.real, d.imag, 0.0)) for d in offsets]
     best = sorted(filter(is_rival, aligned(starts, _COARSE)), key=_score, reverse=True)[:_MAX_FINE]
     return any(
         is_rival(rival)
         and not len(rival.unobservable)
-        and _score(rival) > (1 - _EQUAL) * _score(own)
+        and _score(rival) > (1 - equal) * _score(own)
         for rival in aligned([b.T_world_source for b in best], _FINE)
     )
 
