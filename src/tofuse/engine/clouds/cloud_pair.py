@@ -305,9 +305,16 @@ def _registered_views(
     proposed, found = _proposed(views, start, guessed=guess is not None)
     poses += proposed
     best = _best(views, poses, found, local, guess, certain)
-    more = [] if found is None else found.poses[_MAX_REFINED:_MANY_REFINED]
-    if more and (best.probability or 0.0) < _LIKELY:
-        poses += [views.refined(c.T_target_source) for c in more]
+    more = [] if found is None else [c.T_target_source for c in found.poses[:_MANY_REFINED]]
+    more = more[_MAX_REFINED:]
+    if (best.probability or 0.0) >= _LIKELY:
+        chosen = best.T_target_source
+        if any(views.are_distinct_poses(pose.T_target_source, chosen) for pose in proposed):
+            more = []
+        else:  # without a rival, its lead is unknown
+            more = [T for T in more if views.are_distinct_poses(T, chosen)]
+    if more:
+        poses += [views.refined(T) for T in more]
         best = _best(views, poses, found, local, guess, certain)
     return views.with_information(best)
 
