@@ -25,7 +25,7 @@ from tofuse.apps.cli.commands import VERDICT_COLORS, show
 from tofuse.apps.cli.options import Batch
 from tofuse.apps.cli.progress import emit, escaped, progress_for
 from tofuse.apps.cli.run_arguments import run_arguments
-from tofuse.engine.compute import usable_cores
+from tofuse.engine.compute import thread_count
 from tofuse.engine.errors import Ended, InputError, TofuseError
 
 _RETRIES = 3
@@ -83,7 +83,7 @@ def _run(
     if arguments.scheduler is None:
         count = min(arguments.workers or 1, len(remaining))
         workers: Workers = LocalWorkers(count)
-        threads = max(1, usable_cores() // count)
+        threads = max(1, thread_count() // count)
     else:
         # A worker has a thread per core that it may use, and each thread does one job.
         workers, threads = DaskWorkers(arguments.scheduler), 1

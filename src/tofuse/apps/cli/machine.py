@@ -30,9 +30,9 @@ def check_machine(threads: int | None = None) -> None:
     if limit is None:
         return
     if threads is None:
-        from tofuse.engine.compute import usable_cores
+        from tofuse.engine.compute import thread_count
 
-        threads = usable_cores()
+        threads = thread_count()
     needed = _MIN_BYTES + _BYTES_PER_THREAD * max(0, threads - _INCLUDED_THREADS)
     if limit < needed:
         raise InputError(

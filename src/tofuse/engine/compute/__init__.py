@@ -23,7 +23,6 @@ if TYPE_CHECKING:
         run_chunks,
         thread_count,
         threads,
-        usable_cores,
     )
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

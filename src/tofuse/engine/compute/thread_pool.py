@@ -121,7 +121,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def thread_count() -> int:
-    """Return the number of threads that `run_chunks` uses."""
+    """Return the number of threads that `run_chunks` uses, by default `usable_cores`."""
     return _thread_count
 
 
