@@ -13,6 +13,7 @@ import pytest
 import made_sessions
 from made_sessions import quick
 from tofuse.apps.cli.program import main
+from tofuse.apps.export.exporting import export
 from tofuse.apps.jobs import merging
 from tofuse.apps.jobs.merging import merge_sessions, merged_config
 from tofuse.apps.jobs.running import exit_status
@@ -195,6 +196,13 @@ def test_missing_recording_is_named_with_remedy(session_results, tmp_path) -> No
     refused(
         [session_results["here"], again], str(tmp_path / "was-here"), "doesn't exist", "put it back"
     )
+
+
+def test_exported_images_have_the_times_of_the_map(pair, tmp_path) -> None:
+    (folder,) = export(pair, ["nerfstudio"], tmp_path)
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    times, _ = read_tum(pair / "trajectory.txt")
+    np.testing.assert_allclose([frame["timestamp"] for frame in frames], times)
 
 
 def test_changed_recording_is_refused(session_results, tmp_path) -> None:

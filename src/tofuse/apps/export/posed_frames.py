@@ -34,7 +34,8 @@ class PosedFrame:
     where
         Its recording and its number there, for errors.
     frame
-        With z depth and sigma; its camera as the result calibrated it, rectified if requested.
+        With z depth and sigma; its camera as the result calibrated it, rectified if requested; at
+        the time in `run.json`, which in a merged result is not that of its recording.
     image
         (H, W, 3) RGB, black where unknown; None without colour and amplitude. Colour that is
         registered to depth has its recorded resolution, which may be larger than that of depth.
@@ -85,6 +86,7 @@ def posed_frames(
         indices, poses = run_json.main_poses(result, run)
         selected = dict(zip(indices[::every], poses[::every], strict=True))
         covariances = {f["index"]: run_json.frame_covariance(f) for f in run["frames"]}
+        times = {f["index"]: float(f["timestamp"]) for f in run["frames"]}
         parts = list(reopening.stored_recordings(result, run))
         correctors = [CameraErrors.made_with(part.config) for part in parts]
     for part, frame_correctors in zip(parts, correctors, strict=True):
@@ -107,7 +109,7 @@ def posed_frames(
             yield PosedFrame(
                 index,
                 f"{recording.path}: frame {frame.index}",
-                rectified,
+                replace(rectified, timestamp=times[index]),
                 rectified.color_image if full_color is None else full_color,
                 image_camera,
                 selected[index],
