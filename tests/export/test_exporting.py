@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -198,6 +199,17 @@ def test_large_meshes_have_vertex_colours(result: Path, upright, monkeypatch) ->
     s = upright.color / 255
     light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(found, light, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["glb", "stl"])
+def test_a_surface_without_triangles_is_refused(name: str, result: Path) -> None:
+    with pytest.raises(InputError, match="--faces: is too few"):
+        export(result, [name], faces=1)
+    mesh = read_ply(result / "mesh.ply")
+    write_ply(result / "mesh.ply", replace(mesh, faces=np.zeros((0, 3), np.int32)))
+    change_run(result)
+    with pytest.raises(InputError, match=r"mesh\.ply: has no triangles"):
+        export(result, [name])
 
 
 def test_files_of_the_result_itself_are_not_replaced(result: Path, tmp_path: Path) -> None:
