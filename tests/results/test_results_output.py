@@ -15,7 +15,12 @@ from made_results import contents, result, torn
 from tofuse.apps.export.exporting import export
 from tofuse.apps.jobs.running import exit_status
 from tofuse.apps.results import output
-from tofuse.apps.results.folders import OutputFolder, component_number, is_result
+from tofuse.apps.results.folders import (
+    OutputFolder,
+    check_result,
+    component_number,
+    is_result,
+)
 from tofuse.apps.results.loading import load_result
 from tofuse.apps.results.output import write_result
 from tofuse.apps.results.run_json import frames_in_main_model, read_run_json
@@ -277,6 +282,8 @@ def test_invalid_run_json(tmp_path, text, message) -> None:
     with pytest.raises(InputError, match=message):
         read_run_json(file)
     assert not is_result(tmp_path)
+    with pytest.raises(InputError, match=r"run\.json: is damaged, or not a run\.json of tofuse"):
+        check_result(tmp_path)
     with pytest.raises(InputError, match="doesn't exist"):
         read_run_json(tmp_path / "none.json")
     with pytest.raises(InputError, match="is a folder"):

@@ -255,6 +255,13 @@ def check_result(folder: Path) -> None:
     """
     finish_interrupted(result_folder(folder))
     if not is_result(folder):
+        marker = folder / RESULT.marker
+        if marker.exists():
+            raise InputError(
+                "is damaged, or not a run.json of tofuse",
+                where=marker,
+                remedy="copy the whole folder again, or run again",
+            )
         raise InputError(
             "is not a result (no run.json)" if folder.exists() else "doesn't exist",
             where=folder,
