@@ -4,14 +4,22 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from measured_parts import NOISE, drawn, scan
 from tofuse.apps.compare.nearest import Reference
-from tofuse.apps.compare.repeating import Session, components, loaded_sessions, repeated
+from tofuse.apps.compare.repeating import (
+    Session,
+    _pose_differences,
+    components,
+    loaded_sessions,
+    repeated,
+)
 from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import se3
 from tofuse.engine.progress import Silent
 from written_run_json import change_run
 
@@ -64,6 +72,15 @@ def test_differences_between_sessions_are_separated() -> None:
     assert honest.share > 0.95
     assert honest.low < honest.share <= honest.high
     assert found.to_dict()["components"][0]["unit"] == "m"
+
+
+def test_a_camera_that_turned_elsewhere_did_not_repeat_its_path() -> None:
+    turns = se3.exp(np.linspace(0, 0.6, 5)[:, None] * np.eye(6)[4])
+    ends = [turns, turns @ se3.exp(0.02 * np.eye(6)[4]), turns @ se3.exp(0.3 * np.eye(6)[4])]
+    results = [Session("", "", SimpleNamespace(trajectory=t), None) for t in ends]  # type: ignore[arg-type]
+    same = _pose_differences(results[:2], np.stack([np.eye(4)] * 2), 4.0)
+    np.testing.assert_allclose(same[:, 4, 1], 0.02)
+    assert "did not repeat" in _pose_differences(results[::2], np.stack([np.eye(4)] * 2), 4.0)
 
 
 def test_results_of_the_same_frames_are_refused(room_result, tmp_path) -> None:

@@ -33,8 +33,9 @@ from tofuse.engine.results import Reconstruction
 
 # Points of a place in every result.
 _MIN_POINTS = 6
-# Trajectories are repeated ones if the median distance is below this fraction of the diagonal.
-_SAME_PATH = 0.05
+# Trajectories are repeated ones if the median distance is below this fraction of the diagonal, and
+# the median angle below this, rad: a camera that turns on the spot has positions of any other one.
+_SAME_PATH, _SAME_TURN = 0.05, 0.1
 # Dimensions: distances between parallel places, of at least this fraction of the diagonal.
 _PARALLEL, _MIN_LENGTH, _MAX_DIMENSIONS = 0.95, 0.2, 500
 # Errors of places closer than this fraction of the diagonal count as one.
@@ -290,12 +291,15 @@ def _pose_differences(
     if len(trajectories) < len(results) or len({len(t) for t in trajectories}) > 1:
         return "poses are not compared: the results have different numbers of frames"
     finite = np.isfinite(np.stack(trajectories)).all((0, 2, 3))
+    other_path = "poses are not compared: the camera did not repeat its path"
+    if not finite.any():
+        return other_path
     in_first = [T @ t[finite] for T, t in zip(poses, trajectories, strict=True)]
-    apart = [np.linalg.norm(t[:, :3, 3] - in_first[0][:, :3, 3], axis=1) for t in in_first[1:]]
-    if not finite.any() or max(map(np.median, apart)) > _SAME_PATH * diagonal:
-        return "poses are not compared: the camera did not repeat its path"
     back = se3.inverse(in_first[0])
-    return np.stack([se3.log(back @ t) for t in in_first], axis=2)
+    motions = np.stack([se3.log(back @ t) for t in in_first], axis=2)
+    apart = [np.median(np.linalg.norm(part, axis=1), 0) for part in np.split(motions, 2, axis=1)]
+    is_same = apart[0].max() <= _SAME_PATH * diagonal and apart[1].max() <= _SAME_TURN
+    return motions if is_same else other_path
 
 
 def _held_surface(centres: Float64, y: Float64, s: Float64, diagonal: float) -> Held:
