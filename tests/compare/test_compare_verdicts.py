@@ -10,7 +10,7 @@ import pytest
 import tofuse
 from measured_parts import NOISE, drawn, scan
 from tofuse.apps.compare import deviations as module
-from tofuse.apps.compare.comparing import compared
+from tofuse.apps.compare.comparing import _regions, compared
 from tofuse.apps.compare.deviations import COVERAGE
 from tofuse.apps.compare.nearest import Reach, Reference
 from tofuse.apps.compare.surface import Surface, in_metres
@@ -106,6 +106,15 @@ def test_errors_without_bound_leave_all_undecided(part) -> None:
     assert found.verdict == "undecided"
     assert "not bounded" in found.sentence
     assert {r.verdict for r in found.regions} == {"undecided", "not seen"}
+
+
+def test_a_rejected_registration_leaves_every_place_undecided(part) -> None:
+    found = compared(scan(part, bump=0.006), part, 0.001, searched=False)
+    assert {"fail", "pass"} & {row["verdict"] for row in found.worst}
+    rejected = replace(found, reason="the registration is not accepted")
+    assert {row["verdict"] for row in rejected.worst} == {"undecided"}
+    regions = _regions(found.deviations, part, 0.001, decided=False)
+    assert not any(r.outside or r.changed or r.verdict in ("pass", "fail") for r in regions)
 
 
 def test_changes_are_significant_from_the_detection_limit(part) -> None:

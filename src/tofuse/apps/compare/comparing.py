@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse._version import __version__
-from tofuse.apps.compare.deviations import COVERAGE, DeviationMap, fitted, mapped
+from tofuse.apps.compare.deviations import COVERAGE, DeviationMap, Places, fitted, mapped
 from tofuse.apps.compare.nearest import Reach, Reference, measured_points
 from tofuse.apps.compare.surface import Comparable, Surface, in_metres, spacing_of, surface_of
 from tofuse.apps.pairs import PairResult, pair_words, register
 from tofuse.apps.report import scene, words
 from tofuse.apps.results import run_json
 from tofuse.engine.alignment import Registration
-from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.errors import InputError, RegistrationError
 from tofuse.engine.frames import CloudFrame
 from tofuse.engine.fusion import GeometryRecord
@@ -132,7 +132,7 @@ class Comparison:
     def worst(self) -> list[dict[str, Any]]:
         """The places that deviate most, of each region."""
         places = self.deviations.places
-        verdicts = places.verdicts(self.tolerance_m or np.inf)
+        verdicts = _verdicts(places, self.tolerance_m, decided=not self.reason)
         rows: list[dict[str, Any]] = []
         for k, region in enumerate(self.regions):
             of = np.flatnonzero(places.region == k)
@@ -223,6 +223,13 @@ class Comparison:
 def _places(chosen: Bool) -> str:
     count = int(chosen.sum())
     return f"{count} of {len(chosen)} places {'is' if count == 1 else 'are'}"
+
+
+def _verdicts(places: Places, tolerance_m: float | None, *, decided: bool) -> Intp:
+    """The verdicts of places; 0, undecided, without a tolerance or if nothing can be decided."""
+    if tolerance_m is None or not decided:
+        return np.zeros(len(places.deviation), np.intp)
+    return places.verdicts(tolerance_m)
 
 
 def _word(verdict: int) -> Verdict:
@@ -444,7 +451,8 @@ def _regions(
     areas = np.bincount(reference.region, area)
     seen = np.bincount(reference.region, area * deviations.seen) / areas
     facing = [np.bincount(reference.region, area * reference.normals[:, k]) for k in range(3)]
-    verdicts = places.verdicts(np.inf if tolerance_m is None else tolerance_m)
+    verdicts = _verdicts(places, tolerance_m, decided=decided)
+    changed = places.changed & decided
     name: Callable[[int], str] = _namer(np.stack(facing, 1) / areas[:, None], reference.has_faces)
     regions = []
     for k in range(count):
@@ -454,13 +462,11 @@ def _regions(
             continue
         of = verdicts[chosen]
         verdict: Verdict = "fail" if (of < 0).any() else "pass" if (of > 0).all() else "undecided"
-        if tolerance_m is None or not decided:
-            verdict = "undecided"
         worst = np.flatnonzero(chosen)[np.abs(places.deviation[chosen]).argmax()]
         regions.append(
             Region(
                 name(k), float(areas[k]), float(seen[k]), verdict, len(of), int((of < 0).sum()),
-                int(places.changed[chosen].sum()), *places.mean(chosen),
+                int(changed[chosen].sum()), *places.mean(chosen),
                 float(places.deviation[worst]), float(places.sigma[worst]),
                 float(places.detectable[chosen].max()),
             )
