@@ -8,8 +8,9 @@ import pytest
 
 import tofuse
 from tofuse.apps.rigs.checking import compare, compare_in_scene
-from tofuse.apps.rigs.inputs import Camera
+from tofuse.apps.rigs.inputs import Camera, open_cameras
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.formats.rigs.rig_file import Rig, RigCamera, read_rig, write_rig
 
@@ -94,6 +95,14 @@ def test_images_of_the_calibration_are_recognised(tmp_path: Path) -> None:
     assert again.with_same_images(Rig(other)) == ("right",)
     unknown = replace(rig.cameras[0], first_image="")
     assert Rig((unknown,)).with_same_images(Rig((unknown,))) == ()
+
+
+def test_recordings_in_another_order_are_refused(tmp_path: Path) -> None:
+    paths = [tmp_path / "monday" / name for name in ("right", "left")]
+    with pytest.raises(InputError, match=r"right: is given for .*order left, right"):
+        open_cameras(paths, names=["left", "right"])
+    with pytest.raises(InputError, match="exist"):  # other names say nothing
+        open_cameras(paths, names=["a", "b"])
 
 
 def test_camera_without_common_surface_is_not_compared() -> None:

@@ -89,8 +89,8 @@ def open_cameras(
     Raises
     ------
     InputError
-        If there are fewer than two, too many, or not as many as names; if one can't be opened, or
-        is given twice.
+        If there are fewer than two, too many, or not as many as names; if one can't be opened, is
+        given twice, or has the name of another camera.
     """
     if names is not None and len(paths) != len(names):
         raise InputError(
@@ -106,9 +106,17 @@ def open_cameras(
     for k, path in enumerate(resolved):
         if path in resolved[:k]:
             raise InputError("is given twice", where=paths[k], remedy="pass each camera once")
+    own_names = unique_names(resolved)
+    for name, own_name, recording in zip(names or own_names, own_names, paths, strict=True):
+        if own_name != name and own_name in (names or ()):
+            raise InputError(
+                f"is given for the camera {name}, but has the name of another one of the rig",
+                where=recording,
+                remedy=f"pass the recordings in the order {', '.join(names or ())}, or rename it",
+            )
     return [
         Camera(name, open_recording(path, format=format))
-        for name, path in zip(names or unique_names(resolved), paths, strict=True)
+        for name, path in zip(names or own_names, paths, strict=True)
     ]
 
 
