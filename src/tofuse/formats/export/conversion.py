@@ -327,7 +327,7 @@ def _finish_tum(recording: Recording, folder: Path, camera: Pinhole, written: li
         atomic.write_text(folder / f"{name}.txt", "# timestamp filename\n" + "".join(lines))
     if recording.reference is not None:
         write_tum(folder / "groundtruth.txt", times, recording.reference[written])
-    # The layout does not store the camera; this file is for --camera.
+    # The layout does not store the camera; our reader takes this file for it.
     description = {"schema": camera_file.SCHEMA, **camera_file.camera_fields(camera)}
     description |= {"depth_unit_m": 1 / COUNTS_PER_M["tum"], "depth_kind": "z"}
     atomic.write_text(folder / "lens.json", json.dumps(description, indent=1) + "\n")

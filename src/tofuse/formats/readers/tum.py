@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from tofuse.formats.poses import associate
 from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff, inputs
 
 DEPTH_UNIT_M = 1 / 5000
+LENS = "lens.json"  # a camera.json, written by `tofuse convert`
 COLOR_LIMIT_S = 0.1
 _PAIRS = re.compile(r"assoc[a-z]*\.txt")
 SENSOR = "Kinect v1 or Xtion (structured light)"  # of the benchmark
@@ -56,6 +58,8 @@ class Tum(Reader):
         lists = _read_lists(path)
         times, files = lists[0]
         named = camera_of(path)
+        if options.camera is None and reading.is_file(path / LENS):
+            options, named = replace(options, camera=path / LENS), None
         camera = _calibrated(path / "calibration.txt", files) or named
         if camera is None and options.camera is None:
             raise InputError(
