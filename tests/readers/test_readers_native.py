@@ -17,6 +17,7 @@ from tofuse.formats.images.images import write_png
 from tofuse.formats.poses.trajectory import write_tum
 from tofuse.formats.readers.native import NativeSource
 from tofuse.formats.recordings.native import RecordingWriter
+from tofuse.formats.recordings.open import open_recording
 
 PINHOLE = Pinhole(40, 30, 35.0, 36.0, 19.5, 14.5)
 CAMERAS: list[Camera] = [
@@ -352,16 +353,37 @@ def test_rays_with_forged_header(tmp_path: Path) -> None:
 
 
 def test_damaged_frame_is_an_unreadable_frame(tmp_path: Path) -> None:
-    folder = write(tmp_path / "a")
+    folder = write(tmp_path / "a", 5)
     path = folder / "depth" / "000001.png"
     path.write_bytes(path.read_bytes()[:200])
     write_png(folder / "depth" / "000002.png", np.zeros((30, 40), np.uint8))
-    (folder / "color" / "000003.png").write_bytes(b"")
+    (folder / "amplitude" / "000003.png").write_bytes(b"")
+    (folder / "confidence" / "000004.png").write_bytes(b"")
     source = NativeSource(folder)
     assert len(source.read(0))
-    for k, name in ((1, "depth/000001.png"), (2, "depth/000002.png"), (3, "color/000003.png")):
+    broken = ["depth/000001.png", "depth/000002.png", "amplitude/000003.png"]
+    for k, name in enumerate([*broken, "confidence/000004.png"], 1):
         with pytest.raises(UnreadableFrameError, match=name):
             source.read(k)
+
+
+def test_frames_with_damaged_colour_are_used_without_it(tmp_path: Path) -> None:
+    """One note counts them, also in a recording of several."""
+    write(tmp_path / "a")
+    folder = write(tmp_path / "b")
+    (folder / "color" / "000001.png").write_bytes(b"")
+    write_png(folder / "color" / "000002.png", np.zeros((31, 40, 3), np.uint8))
+    (folder / "color" / "000003.png").unlink()
+    (folder / "color" / "000003.png").symlink_to(tmp_path / "missing.png")
+    recording = open_recording(tmp_path / "a", folder, max_depth=9)
+    notes = recording.warnings
+    for _ in range(2):  # not counted again
+        colors = [frame.color_image is not None for frame in recording]
+        assert colors == [True] * 5 + [False] * 3
+    (note,) = set(recording.warnings) - set(notes)
+    assert note.startswith("3 frames are used without colour")
+    assert "color/000001.png: is empty" in note
+    np.testing.assert_array_equal(recording[6].depth, recording[2].depth)
 
 
 def test_camera_of_different_image_size(tmp_path: Path) -> None:

@@ -79,6 +79,9 @@ def run(
                 progress=progress,
                 tracked_frames=tracked_file,
             )
+            for note in result.recording["warnings"]:
+                if note not in job.notes:
+                    progress.note(note)
             if options.mirrors:
                 result = _without_mirrors(job, result, options, progress)
             texture = _texture(job, result, options, progress)
@@ -112,7 +115,8 @@ def run(
 class _Job:
     """A recording and the settings of its reconstruction.
 
-    `findings` are problems of the recording that a quick inspection found.
+    `findings` are problems of the recording that a quick inspection found, `notes` those of its
+    reader that were shown.
     """
 
     opening: Opening
@@ -121,6 +125,7 @@ class _Job:
     seed: int
     loops: tuple[PriorLoop, ...]
     findings: tuple[Finding, ...]
+    notes: tuple[str, ...]
 
 
 @timing("opening")
@@ -130,6 +135,7 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
     seed = seed_of(options)
     opening = Opening.of(inputs, options)
     recording = opening.open()
+    notes = tuple(recording.warnings)  # before most frames are read, which may add some
     if (frame := recording.first_readable()) is not None:  # shown before any work begins
         progress.placed(frame, np.eye(4))
     config = resolve(options, reconstructing.view_kind(recording))
@@ -143,9 +149,9 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
     loops = tuple(read_loops(options.loops, indices)) if options.loops else ()
     # At the start, so that problems of the recording are reported before hours of work.
     findings = quick_findings(recording, config, turning=options.object)
-    for warning in (*recording.warnings, *(str(f) for f in findings)):
-        progress.note(warning)
-    return _Job(opening, recording, config, seed, loops, findings)
+    for note in (*notes, *(str(f) for f in findings)):
+        progress.note(note)
+    return _Job(opening, recording, config, seed, loops, findings, notes)
 
 
 @timing("mirrors")

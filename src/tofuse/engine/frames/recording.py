@@ -42,7 +42,7 @@ class Source(Protocol):
         (N, 4) unit vector along gravity in the camera's frame, and its standard deviation in rad
         (`recordings.imu`), NaN where unknown; or None.
     warnings
-        Notes for the user on how the recording was read, one line each.
+        Notes for the user on how the recording was read so far, one line each.
     metadata
         Properties for `inspect` and reports (sensor, ambiguity_m, confidence_max ...).
     """
@@ -51,8 +51,12 @@ class Source(Protocol):
     reference: Float64 | None
     odometry: Float64 | None
     gravity: Float64 | None
-    warnings: list[str]
     metadata: dict[str, Any]
+
+    @property
+    def warnings(self) -> list[str]:
+        """Notes for the user; some count frames, and change while these are read."""
+        ...
 
     def read(self, index: int) -> Frame:
         """Read frame `index`; raise UnreadableFrameError if it can't be read."""

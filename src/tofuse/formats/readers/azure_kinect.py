@@ -157,7 +157,7 @@ class AzureKinectSource(FileSource):
         block = self.infrared[index]
         infrared = None if block is None else self._image(block).astype(np.float32)
         frame = self.image(index, depth, amplitude_image=infrared)
-        color = self._color_image(index, frame)
+        color = self.color_if_readable(index, lambda: self._color_image(index, frame))
         return frame if color is None else replace(frame, color_image=color)
 
     def _image(self, block: matroska.Block) -> UInt16:

@@ -69,7 +69,11 @@ class Depth16Source(FileSource):
             index,
             depth,
             confidence_image=confidence.astype(np.uint8),
-            color_image=None if color is None else pixels.resized(read_color(color), size, color),
+            color_image=None
+            if color is None
+            else self.color_if_readable(
+                index, lambda: pixels.resized(read_color(color), size, color)
+            ),
         )
 
 

@@ -108,8 +108,9 @@ class NativeSource(FileSource):
         images: dict[str, Any] = {"camera": camera}
         if self.color:
             path, frame = self.color[index], self.image(index, depth, camera=camera)
-            images["color_image"] = pixels.sampled_color(
-                frame, read_color(path), self.description.color, path
+            images["color_image"] = self.color_if_readable(
+                index,
+                lambda: pixels.sampled_color(frame, read_color(path), self.description.color, path),
             )
         if self.amplitude:
             counts = self._read(self.amplitude, index, "uint16")

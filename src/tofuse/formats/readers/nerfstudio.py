@@ -118,7 +118,11 @@ class NerfstudioSource(FileSource):
             index,
             depth,
             camera=camera,
-            color_image=None if color is None else pixels.resized(read_color(color), size, color),
+            color_image=None
+            if color is None
+            else self.color_if_readable(
+                index, lambda: pixels.resized(read_color(color), size, color)
+            ),
             sigma_image=sigma_image,
         )
 

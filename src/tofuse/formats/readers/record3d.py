@@ -92,17 +92,21 @@ class Record3DSource(FileSource):
         """See `FileSource.load`."""
         number = self.store.numbers[index]
         depth = self.store.depth(number, self.size)
-        stored, color = self.store.color(number), None
-        if stored is not None:
-            color = pixels.resized(as_color(parse_image(*stored)), self.size, stored[1])
         confidence = self.store.confidence(number, self.size)
         return self.image(
             index,
             depth,
             camera=self.cameras[index],
             confidence_image=confidence,
-            color_image=color,
+            color_image=self.color_if_readable(index, lambda: self._read_color(number)),
         )
+
+    def _read_color(self, number: int) -> UInt8 | None:
+        """The colour (H, W, 3) of a frame, at the size of depth."""
+        stored = self.store.color(number)
+        if stored is None:
+            return None
+        return pixels.resized(as_color(parse_image(*stored)), self.size, stored[1])
 
 
 class _Folder:

@@ -107,10 +107,12 @@ class SensSource(FileSource):
         if not packed_color or self.color_camera is None:
             return frame
         where = f"{where}: colour"
-        image = self._color(packed_color, where)
-        return replace(
-            frame, color_image=pixels.sampled_color(frame, image, self.color_camera, where)
-        )
+
+        def read_color() -> UInt8:
+            image = self._color(packed_color, where)
+            return pixels.sampled_color(frame, image, self.color_camera, where)
+
+        return replace(frame, color_image=self.color_if_readable(index, read_color))
 
     def _read_header(self, file: BinaryIO) -> int:
         version, length = struct.unpack("<IQ", self._take(file, 12))

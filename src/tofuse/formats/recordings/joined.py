@@ -24,7 +24,7 @@ class JoinedSource:
         self.concurrent = all(getattr(p, "concurrent", False) for p in self.parts)
         counts = [len(p.timestamps) for p in self.parts]
         self.starts = np.concatenate([[0], np.cumsum(counts)]).astype(int)
-        self.warnings = _joined_warnings(self.parts, names)
+        self._names, self._notes = list(names), list[str]()
         self.timestamps = self._joined_times(names)
         self.reference = _joined([p.reference for p in self.parts], counts, (4, 4))
         self.odometry = _joined([p.odometry for p in self.parts], counts, (4, 4))
@@ -41,6 +41,11 @@ class JoinedSource:
             {"name": name, "frames": count} for name, count in zip(names, counts, strict=True)
         ]
 
+    @property
+    def warnings(self) -> list[str]:
+        """See `Source.warnings`."""
+        return [*_joined_warnings(self.parts, self._names), *self._notes]
+
     def _joined_times(self, names: Sequence[str]) -> Float64:
         times: list[Float64] = []
         for part, name in zip(self.parts, names, strict=True):
@@ -51,7 +56,7 @@ class JoinedSource:
                 step = float(np.median(steps)) if len(steps) else 1.0
                 shift = last + max(step, 1e-3) - float(part_times.min())
                 part_times = part_times + shift
-                self.warnings.append(f"{name}: timestamps start again, shifted by {shift:.6g} s")
+                self._notes.append(f"{name}: timestamps start again, shifted by {shift:.6g} s")
             times.append(part_times)
         return np.concatenate(times)
 
@@ -100,8 +105,12 @@ class LimitedSource:
         self.reference = source.reference
         self.odometry = source.odometry
         self.gravity = source.gravity
-        self.warnings = source.warnings
         self.metadata = source.metadata
+
+    @property
+    def warnings(self) -> list[str]:
+        """See `Source.warnings`."""
+        return self.source.warnings
 
     def origin(self, index: int) -> tuple[Source, int]:
         """See `JoinedSource.origin`."""

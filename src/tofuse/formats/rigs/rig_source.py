@@ -55,21 +55,26 @@ class RigSource:
                 for _, c, row in rows
             ]
         )
-        self.warnings: list[str] = [
-            f"{camera.name}: {warning}"
-            for camera, recording in zip(rig.cameras, recordings, strict=True)
-            for warning in recording.warnings
-        ]
-        if not any(camera.covariance.any() for camera in rig.cameras[1:]):
-            self.warnings.append(
-                "the rig has no covariances: the accuracy leaves out errors of its cameras' poses"
-            )
         self.metadata: dict[str, Any] = {
             key: value
             for key, value in recordings[0].metadata.items()
             if all(r.metadata.get(key) == value for r in recordings)
         }
         self.metadata["cameras"] = [camera.name for camera in rig.cameras]
+
+    @property
+    def warnings(self) -> list[str]:
+        """See `Source.warnings`."""
+        lines = [
+            f"{camera.name}: {warning}"
+            for camera, recording in zip(self.rig.cameras, self._recordings, strict=True)
+            for warning in recording.warnings
+        ]
+        if not any(camera.covariance.any() for camera in self.rig.cameras[1:]):
+            lines.append(
+                "the rig has no covariances: the accuracy leaves out errors of its cameras' poses"
+            )
+        return lines
 
     def _rows(self) -> Intp:
         """(N, 3) instant, camera, and position in the recording of each frame."""

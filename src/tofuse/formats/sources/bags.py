@@ -226,9 +226,14 @@ class BagSource(FileSource):
         k = None if self.color is None else self.color.nearest(time, MAX_GAP_S)
         if self.color is None or k is None:
             return frame
-        where = f"{where}, colour"
-        color = self.read_color(self.color, k, where)
-        return replace(frame, color_image=sampled_color(frame, color, self.color_camera, where))
+        track, message, where = self.color, k, f"{where}, colour"
+
+        def read_color() -> UInt8:
+            with reading.library_errors(where, REMEDY):
+                color = self.read_color(track, message, where)
+            return sampled_color(frame, color, self.color_camera, where)
+
+        return replace(frame, color_image=self.color_if_readable(index, read_color))
 
     def read_depth(self, index: int, where: str) -> Float32:
         """Return the depth (H, W) of a frame in m."""

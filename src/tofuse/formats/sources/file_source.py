@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
@@ -58,6 +59,8 @@ class FileSource(ABC):
         self.gravity: Float64 | None = None
         self.warnings: list[str] = []
         self.metadata: dict[str, Any] = {}
+        self._unread_colors: dict[int, str] = {}  # errors by frame
+        self._unread_note, self._unread_lock = "", Lock()
 
     def where(self, index: int) -> str:
         """Return the name of a frame for errors."""
@@ -85,6 +88,26 @@ class FileSource(ABC):
         }
         time = float(self.timestamps[index])
         return RangeFrame(index=index, timestamp=time, depth=depth, **(common | others))
+
+    def color_if_readable(self, index: int, read: Callable[[], UInt8 | None]) -> UInt8 | None:
+        """Return the colour of a frame by calling `read`; None if that raises InputError.
+
+        Depth is of use without it. One of the `warnings` counts such frames.
+        """
+        try:
+            with reading.about(self.where(index)):
+                return read()
+        except InputError as error:
+            with self._unread_lock:
+                self._unread_colors[index] = str(error)
+                first = self._unread_colors[min(self._unread_colors)]
+                others = [line for line in self.warnings if line is not self._unread_note]
+                self._unread_note = (
+                    f"{len(self._unread_colors)} frames are used without colour, as it can't be "
+                    f"read, the first: {first}"
+                )
+                self.warnings[:] = [*others, self._unread_note]
+            return None
 
     def full_resolution_color(self, index: int) -> UInt8 | None:
         """Return the colour of a frame at its recorded resolution, if it has the view of depth.
@@ -198,13 +221,22 @@ class DepthImageSource(FileSource):
         path = None if self.color is None else self.color[index]
         if path is None:
             return frame
-        color, registered = read_color(path), self.color_registered
+        return replace(
+            frame,
+            color_image=self.color_if_readable(index, lambda: self._read_color(path, frame)),
+            color_registered=self.color_registered or self.color_camera is not None,
+        )
+
+    def _read_color(self, path: Path, frame: RangeFrame) -> UInt8:
+        """The colour (H, W, 3) of a frame, from its image."""
+        color = read_color(path)
         if self.color_camera is not None:
-            color, registered = sampled_color(frame, color, self.color_camera, path), True
-        elif color.shape[:2] != counts.shape:
+            return sampled_color(frame, color, self.color_camera, path)
+        height, width = frame.depth.shape
+        if color.shape[:2] != (height, width):
             raise InputError(
-                f"is {color.shape[1]} x {color.shape[0]} pixels, depth {size[0]} x {size[1]}",
+                f"is {color.shape[1]} x {color.shape[0]} pixels, depth {width} x {height}",
                 where=path,
                 remedy="register colour to depth, pass its camera in camera.json, or leave it out",
             )
-        return replace(frame, color_image=color, color_registered=registered)
+        return color

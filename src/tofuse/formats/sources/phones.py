@@ -96,7 +96,7 @@ class PhoneSource(FileSource):
             self.read_depth(index, size),
             camera=camera,
             confidence_image=None if confidence is None else self.read_confidence(confidence, size),
-            color_image=self._read_color(index, size),
+            color_image=self.color_if_readable(index, lambda: self._read_color(index, size)),
         )
 
     def read_depth(self, index: int, size: tuple[int, int]) -> Float32:
