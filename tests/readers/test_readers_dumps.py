@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,22 @@ def test_polycam(tmp_path: Path) -> None:
             check_lens(frame, made_phones.FX + k, made_phones.CX, made_phones.CY)
             assert frame.color_image is not None
         assert recording.warnings == []
+
+
+def test_polycam_with_corrected_cameras_and_images_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "scan"
+    made.make_polycam(folder)
+    shutil.rmtree(folder / "keyframes" / "cameras")
+    (folder / "keyframes" / "images").rename(folder / "keyframes" / "corrected_images")
+    recording = open_recording(folder)
+    assert recording.format == "polycam"
+    check_frames(recording)
+    for k, frame in enumerate(recording):
+        check_lens(frame, made_phones.FX + k, made_phones.CX, made_phones.CY)
+        assert frame.color_image is None
+    lens, color = recording.warnings
+    assert "cameras/ is missing: the lenses are those of corrected_cameras/" in lens
+    assert "images/ is missing: colour is left out" in color
 
 
 def test_polycam_without_optimised_poses(tmp_path: Path) -> None:

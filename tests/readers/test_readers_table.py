@@ -91,6 +91,17 @@ def test_recording_is_read_completely(tmp_path: Path, name: str) -> None:
     np.testing.assert_allclose(digest(recording), DIGESTS[name], rtol=1e-3, atol=2e-4)
 
 
+@pytest.mark.parametrize("name", ["polycam", "3dscannerapp", "7scenes", "scannet", "redwood"])
+def test_suffixes_in_capitals(tmp_path: Path, name: str) -> None:
+    path, format_ = made(name, tmp_path)
+    for file in [p for p in (tmp_path / path).rglob("*.*") if p.is_file()]:
+        if "trinsic" not in file.name and file.suffix != ".log":
+            file.rename(file.with_suffix(file.suffix.upper()))
+    recording = open_recording(tmp_path / path)
+    assert recording.format == format_
+    np.testing.assert_allclose(digest(recording), DIGESTS[name], rtol=1e-3, atol=2e-4)
+
+
 Change = Callable[[Path], object]
 REFUSED = "refused"
 

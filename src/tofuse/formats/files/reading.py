@@ -270,8 +270,8 @@ def files_named(path: Path, matches: Callable[[str], object]) -> list[Path]:
 
 
 def first_file(*paths: Path) -> Path | None:
-    """Return the first of the paths that is an accessible file; None if none is."""
-    return next((path for path in paths if is_file(path)), None)
+    """Return the first of the paths that is an accessible file, as `if_file`; None if none is."""
+    return next((file for path in paths if (file := if_file(path)) is not None), None)
 
 
 def first_readable(items: Iterable[T], read: Callable[[T], R], nothing: InputError) -> R:
@@ -292,8 +292,9 @@ def first_readable(items: Iterable[T], read: Callable[[T], R], nothing: InputErr
 
 
 def if_file(path: Path) -> Path | None:
-    """Return the path if it is an accessible file, else None."""
-    return path if is_file(path) else None
+    """Return the path, or else that with its suffix in capitals, if it is an accessible file."""
+    capital = path.with_suffix(path.suffix.upper())
+    return next((file for file in (path, capital) if is_file(file)), None)
 
 
 def is_file(path: Path) -> bool:

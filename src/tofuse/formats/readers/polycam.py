@@ -17,6 +17,7 @@ from tofuse.formats.images import first_size
 from tofuse.formats.sources import Reader, ReaderOptions, Sniff, inputs, phones
 
 _POSE = [f"t_{row}{column}" for row in range(3) for column in range(4)]
+_CORRECTED = "corrected_cameras"
 _LEVELS = 255.0  # the confidences low, medium and high are stored as 0, 127 and 255
 
 
@@ -27,8 +28,9 @@ class Polycam(Reader):
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         folder = _keyframes(path)
-        if reading.is_folder(folder / "depth") and reading.is_folder(folder / "cameras"):
-            return Sniff(1.0, f"{folder.name}/ with depth/ and cameras/")
+        cameras = _lens_folder(folder)
+        if reading.is_folder(folder / "depth") and reading.is_folder(cameras):
+            return Sniff(1.0, f"{folder.name}/ with depth/ and {cameras.name}/")
         return None
 
     def open(self, path: Path, options: ReaderOptions) -> phones.PhoneSource:
@@ -51,19 +53,36 @@ class PolycamSource(phones.PhoneSource):
         super().__init__(
             files,
             _times(files),
-            confidence=[reading.if_file(folder / "confidence" / file.name) for file in files],
+            confidence=[
+                reading.if_file(folder / "confidence" / f"{file.stem}.png") for file in files
+            ],
             color=[reading.if_file(folder / "images" / f"{file.stem}.jpg") for file in files],
         )
-        paths = [folder / "cameras" / f"{file.stem}.json" for file in files]
-        self.cameras = inputs.cameras_of(
-            paths, lambda path: _lens(reading.read_json(path), size, path)
-        )
+        self._read_lenses(folder, size)
         self._read_poses(folder)
+
+    def _read_lenses(self, folder: Path, size: tuple[int, int]) -> None:
+        """Read ARKit's lenses, or those of the corrected images: warn that these are others."""
+        lenses = _lens_folder(folder)
+        if lenses.name == _CORRECTED:
+            self.warnings.append(
+                f"cameras/ is missing: the lenses are those of {_CORRECTED}/, which differ "
+                "slightly from those of depth: export 'raw data' again"
+            )
+        if not any(self.color) and reading.is_folder(folder / "corrected_images"):
+            self.warnings.append(
+                "images/ is missing: colour is left out, as corrected_images/ show another view"
+            )
+        paths = [lenses / f"{file.stem}.json" for file in self.files]
+        self.cameras = inputs.cameras_of(
+            [reading.if_file(path) or path for path in paths],
+            lambda path: _lens(reading.read_json(path), size, path),
+        )
 
     def _read_poses(self, folder: Path) -> None:
         """Read Polycam's optimised poses, else ARKit's; never a mix, as they differ too much."""
-        paths = [folder / "corrected_cameras" / f"{file.stem}.json" for file in self.files]
-        if any(reading.is_file(path) for path in paths):
+        paths = [folder / _CORRECTED / f"{file.stem}.json" for file in self.files]
+        if any(reading.if_file(path) for path in paths):
             self.metadata[POSES_BY] = "Polycam"
         else:
             paths = [folder / "cameras" / path.name for path in paths]
@@ -79,6 +98,12 @@ class PolycamSource(phones.PhoneSource):
 
 def _keyframes(path: Path) -> Path:
     return path / "keyframes" if reading.is_folder(path / "keyframes") else path
+
+
+def _lens_folder(folder: Path) -> Path:
+    """The folder of ARKit's cameras, or else of those that Polycam optimised."""
+    own, corrected = folder / "cameras", folder / _CORRECTED
+    return corrected if reading.is_folder(corrected) and not reading.is_folder(own) else own
 
 
 def _times(files: list[Path]) -> Float64:

@@ -28,7 +28,7 @@ class ScannerApp(Reader):
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         files = reading.files_named(path, _DEPTH.fullmatch)
-        if any(reading.is_file(_file_of_frame(file, "frame", ".json")) for file in files[:9]):
+        if any(reading.if_file(_file_of_frame(file, "frame", ".json")) for file in files[:9]):
             return Sniff(1.0, f"{len(files)} depth_*.png with frame_*.json")
         return None
 
@@ -48,7 +48,8 @@ class ScannerApp(Reader):
         for k, file in enumerate(files):
             entry = None
             try:
-                metadata = _FrameMetadata.read(_file_of_frame(file, "frame", ".json"))
+                facts = _file_of_frame(file, "frame", ".json")
+                metadata = _FrameMetadata.read(reading.if_file(facts) or facts)
                 source.timestamps[k] = metadata.time
                 source.cameras.append(metadata.lens(size))
                 entry = metadata

@@ -122,7 +122,8 @@ def poses_from_files(
     source: Source, files: Iterable[Path], read: Callable[[Path], Float64]
 ) -> Float64 | None:
     """Return the poses of one file per frame, which may be missing; see `poses_of`."""
-    return poses_of(source, files, lambda path: read(path) if reading.is_file(path) else None)
+    found = (reading.if_file(path) for path in files)
+    return poses_of(source, found, lambda file: None if file is None else read(file))
 
 
 def read_matrix_pose(table: Float64, where: str) -> Float64:
