@@ -60,6 +60,15 @@ def test_polycam_without_optimised_poses(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.reference[:, :3, 3], POSES[:, :3, 3] + 0.01)
 
 
+def test_nerfstudio_with_views_for_training_alone(tmp_path: Path) -> None:
+    made.make_nerfstudio(tmp_path / "scan")
+    file = (tmp_path / "scan" / "transforms.json").rename(
+        tmp_path / "scan" / "transforms_train.json"
+    )
+    for path in (tmp_path / "scan", file):
+        check_frames(open_recording(path))
+
+
 def test_nerfstudio(tmp_path: Path) -> None:
     made.make_nerfstudio(tmp_path / "scan")
     for path in (tmp_path / "scan", tmp_path / "scan" / "transforms.json"):

@@ -27,7 +27,7 @@ from tofuse.formats.sources import (
     pixels,
 )
 
-NAME = "transforms.json"
+NAMES = ("transforms.json", "transforms_train.json")
 _DEPTH = ("depth_file_path", "depth_path")
 _IMAGES = ("", ".png", ".jpg", ".jpeg")  # NeRFCapture omits suffixes
 _MODELS = {
@@ -49,8 +49,8 @@ class Nerfstudio(Reader):
         """See `Reader.sniff`."""
         file = _file(path)
         head = reading.read_head(file, _HEAD_BYTES) if reading.is_file(file) else b""
-        if file.name == NAME and any(f'"{key}"'.encode() in head for key in _DEPTH):
-            return Sniff(1.0, f"{NAME} with depth")
+        if file.name in NAMES and any(f'"{key}"'.encode() in head for key in _DEPTH):
+            return Sniff(1.0, f"{file.name} with depth")
         return None
 
     def open(self, path: Path, options: ReaderOptions) -> NerfstudioSource:
@@ -228,7 +228,9 @@ class _Frame:
 
 
 def _file(path: Path) -> Path:
-    return path if path.name == NAME and not path.is_dir() else path / NAME
+    if path.name in NAMES and not path.is_dir():
+        return path
+    return reading.first_file(*(path / name for name in NAMES)) or path / NAMES[0]
 
 
 def _sorted(frames: list[_Frame]) -> list[_Frame]:
