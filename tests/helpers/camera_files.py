@@ -10,6 +10,7 @@ import numpy as np
 
 import damaged_files
 import made_arrays
+import made_datasets
 import made_dumps
 import made_exports
 import made_ifm
@@ -73,6 +74,9 @@ OTHERS: dict[str, tuple[Callable[[Path], object], str | None, str]] = {
     "tum": (made_recordings.make_tum, None, "tum"),
     "7scenes": (made_recordings.make_7scenes, None, "7scenes"),
     "redwood": (made_recordings.make_redwood, None, "redwood"),
+    "sun3d": (made_datasets.make_sun3d, None, "sun3d"),
+    "replica": (made_datasets.make_replica, None, "replica"),
+    "pairs": (made_datasets.make_pairs, None, "pairs"),
     "pcd": (damaged_files.make_pcd, None, "pcd"),
     "ply": (damaged_files.make_ply, None, "ply"),
     "xyz": (damaged_files.make_xyz, None, "xyz"),

@@ -37,6 +37,7 @@ METRES: dict[str, tuple[str, str, Callable[[Path], Path]]] = {
 }
 TAKES = ["native", "tum", "7scenes", "redwood", "mkv", "zense", "sens", "npz", "realsense"]
 TAKES += ["orbbec", "kinect2", "depth16", "arducam", "aditof", "mcap", "scannet"]
+TAKES += ["sun3d", "replica", "pairs"]
 REFUSES = [name for name in EVERY if name not in TAKES]
 
 

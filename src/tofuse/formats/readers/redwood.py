@@ -67,13 +67,13 @@ class Redwood(Reader):
                 )
             else:
                 camera = _read_camera(file, camera.sensor)
-        times = _timestamps(files)
+        times = timestamps(files)
         source = DepthImageSource(
             files,
             np.arange(len(files)) / camera.rate if times is None else times,
             camera.lens,
             depth_unit_m=camera.unit,
-            color=_color_files(path, files, times, warnings),
+            color=color_files(path, files, times, warnings),
             sensor=camera.sensor,
             options=options,
         )
@@ -140,23 +140,23 @@ def _read_camera(path: Path, sensor: str) -> _Camera:
     return _Camera(lens, sensor, 1 / counts_per_metre, rate if 0.01 <= rate <= 1e4 else 1.0)
 
 
-def _timestamps(files: list[Path]) -> Float64 | None:
-    """Seconds from names like 000001-000000033369.png (microseconds); None for other names."""
+def timestamps(files: list[Path]) -> Float64 | None:
+    """Return seconds from names like 000001-000000033369.png (microseconds), else None."""
     matches = [_MICROSECONDS.fullmatch(f.stem) for f in files]
     times = np.array([int(m.group(1)) / 1e6 for m in matches if m])
     increase = len(times) == len(files) and (np.diff(times) > 0).all()
     return times if increase else None
 
 
-def _color_files(
+def color_files(
     path: Path, files: list[Path], times: Float64 | None, warnings: list[str]
 ) -> list[Path | None] | None:
-    """The colour image of each depth image: of the nearest time, the same place, name or number."""
+    """Return the colour image of each depth image, by time, place, name or number."""
     folder = next((path / n for n in _COLOR_FOLDERS if reading.is_folder(path / n)), None)
     if folder is None:
         return None
-    color = reading.files_with(folder, ".png", ".jpg", ".jpeg")
-    color_times = _timestamps(color)
+    color = color_images(folder)
+    color_times = timestamps(color)
     if times is not None and color_times is not None:
         nearest = associate(times, color_times, limit=COLOR_LIMIT_S, exclusive=False)
         matches = [color[k] if k >= 0 else None for k in nearest]
@@ -173,6 +173,11 @@ def _color_files(
         "which belong together: colour is ignored"
     )
     return None
+
+
+def color_images(folder: Path) -> list[Path]:
+    """Return the colour images in a folder, in order."""
+    return reading.files_with(folder, ".png", ".jpg", ".jpeg")
 
 
 def _number(path: Path) -> int | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-from tofuse.engine.arrays import Float32, Float64, UInt8
+from tofuse.engine.arrays import Float32, Float64, UInt8, UInt16
 from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import (
@@ -216,7 +216,7 @@ class DepthImageSource(FileSource):
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
         size = (self.camera.width, self.camera.height)
-        counts = read_image(self.files[index], size=size, dtype="uint16")
+        counts = self.read_counts(index, size)
         frame = self.image(index, depth_counts.depth_from_counts(counts, self.unit))
         path = None if self.color is None else self.color[index]
         if path is None:
@@ -226,6 +226,10 @@ class DepthImageSource(FileSource):
             color_image=self.color_if_readable(index, lambda: self._read_color(path, frame)),
             color_registered=self.color_registered or self.color_camera is not None,
         )
+
+    def read_counts(self, index: int, size: tuple[int, int]) -> UInt16:
+        """Return the image (H, W) of a frame, in counts of depth."""
+        return read_image(self.files[index], size=size, dtype="uint16")
 
     def _read_color(self, path: Path, frame: RangeFrame) -> UInt8:
         """The colour (H, W, 3) of a frame, from its image."""

@@ -1,0 +1,134 @@
+"""Readers of data sets on views of a box: unit, lens, and direction and axes of the poses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import made_datasets as made
+from tofuse.engine.errors import InputError
+from tofuse.engine.frames.recording import Recording
+from tofuse.formats.images.images import read_image, write_png
+from tofuse.formats.recordings.open import open_recording
+
+
+def check(recording: Recording, format_: str) -> None:
+    """All points are on the sides of the box, and colour is that of the frame."""
+    assert recording.format == format_
+    assert len(recording) == 3
+    poses = made.POSES if format_ == "pairs" else recording.reference
+    for k, (frame, T) in enumerate(zip(recording, poses, strict=True)):
+        assert frame.camera == made.CAMERA
+        assert frame.valid.all()
+        world = frame.points @ T[:3, :3].T + T[:3, 3]
+        distance = np.abs(np.abs(world) - made.SIDES).min(1)
+        assert distance.max() < 2e-3  # depth is rounded to 1 mm
+        np.testing.assert_array_equal(frame.color_image, made.color(k))
+        assert frame.color_registered
+
+
+def test_sun3d(tmp_path: Path) -> None:
+    made.make_sun3d(tmp_path / "scan1")
+    recording = open_recording(tmp_path / "scan1")
+    check(recording, "sun3d")
+    np.testing.assert_allclose(recording.timestamps, [0, 0.066, 0.132])
+    assert recording.warnings == []
+
+
+def test_sun3d_far_depth(tmp_path: Path) -> None:
+    """Beyond 8.192 m the rotation moves bits to the other end."""
+    made.make_sun3d(tmp_path / "scan1")
+    file = sorted((tmp_path / "scan1" / "depth").iterdir())[0]
+    stored = read_image(file)
+    stored[3, :4] = [(mm << 3) % 65536 | mm >> 13 for mm in (8191, 8192, 12345, 60000)]
+    write_png(file, stored)
+    frame = open_recording(tmp_path / "scan1")[0]
+    np.testing.assert_allclose(frame.depth[3, :4], [8.191, 8.192, 12.345, 60.0], rtol=1e-6)
+
+
+def test_sun3d_with_plain_millimetres_is_refused(tmp_path: Path) -> None:
+    made.make_sun3d(tmp_path / "scan1")
+    for file in (tmp_path / "scan1" / "depth").iterdir():
+        write_png(file, read_image(file) >> 3)
+    with pytest.raises(InputError, match=r"depth: has depth whose bits are not rotated as in SUN3"):
+        open_recording(tmp_path / "scan1")
+
+
+def test_sun3d_without_usable_poses(tmp_path: Path) -> None:
+    made.make_sun3d(tmp_path / "scan1")
+    sorted((tmp_path / "scan1" / "image").iterdir())[-1].unlink()
+    recording = open_recording(tmp_path / "scan1")
+    assert recording.reference is None
+    assert "not 3 rows of 4 for each of 5 images: poses are left out" in recording.warnings[0]
+    shutil.rmtree(tmp_path / "scan1" / "extrinsics")
+    assert open_recording(tmp_path / "scan1").warnings == []
+
+
+@pytest.mark.parametrize("parameters", ["cam_params.json", "../cam_params.json"])
+def test_replica(tmp_path: Path, parameters: str) -> None:
+    made.make_replica(tmp_path / "room0", parameters)
+    check(open_recording(tmp_path / "room0"), "replica")
+
+
+def without_camera(folder: Path) -> None:
+    (folder / "cam_params.json").unlink()
+
+
+def of_other_size(folder: Path) -> None:
+    text = (folder / "cam_params.json").read_text()
+    (folder / "cam_params.json").write_text(text.replace('"w": 64', '"w": 1200'))
+
+
+def without_scale(folder: Path) -> None:
+    about = json.loads((folder / "cam_params.json").read_text())
+    del about["camera"]["scale"]
+    (folder / "cam_params.json").write_text(json.dumps(about))
+
+
+def in_metres(folder: Path) -> None:
+    text = (folder / "cam_params.json").read_text()
+    (folder / "cam_params.json").write_text(text.replace("6553.5", "0.001"))
+
+
+def with_fewer_poses(folder: Path) -> None:
+    lines = (folder / "traj.txt").read_text().splitlines()
+    (folder / "traj.txt").write_text("\n".join(lines[:2]))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (without_camera, r"room0: has no cam_params\.json, nor has the folder above; .* --camera"),
+        (of_other_size, r"depth000000\.png: is 64 x 48 pixels, .* 1200 x 48"),
+        (
+            without_scale,
+            r"cam_params\.json: camera: scale: is missing; correct it there, or use --",
+        ),
+        (in_metres, r"cam_params\.json: scale: is 0\.001, which are no counts"),
+        (with_fewer_poses, r"traj\.txt: has 2 lines of 16 numbers"),
+    ],
+)
+def test_replica_is_refused(tmp_path: Path, change: Callable[[Path], None], says: str) -> None:
+    made.make_replica(tmp_path / "room0")
+    change(tmp_path / "room0")
+    with pytest.raises(InputError, match=says):
+        open_recording(tmp_path / "room0")
+
+
+@pytest.mark.parametrize(
+    "names", [("{:05d}-depth.png", "{:05d}-color.png"), ("depth{:06d}.png", "left{:06d}.png")]
+)
+def test_pairs(tmp_path: Path, names: tuple[str, str]) -> None:
+    made.make_pairs(tmp_path / "scene_01", *names)
+    check(open_recording(tmp_path / "scene_01"), "pairs")
+    camera = (tmp_path / "scene_01" / "camera.json").rename(tmp_path / "camera.json")
+    with pytest.raises(InputError, match=r"use --format pairs with --camera camera\.json, which s"):
+        open_recording(tmp_path / "scene_01")
+    with pytest.raises(InputError, match="neither lens nor unit"):
+        open_recording(tmp_path / "scene_01", format="pairs")
+    check(open_recording(tmp_path / "scene_01", format="pairs", camera=camera), "pairs")
