@@ -194,7 +194,7 @@ DAMAGED: list[tuple[str, Change, str | tuple[int, ...], str]] = [
     ),
     ("redwood", drop("color/000001.png"), (), ONE_IMAGE),
     ("sun3d", put("intrinsics.txt", "570 0 320\n"), REFUSED, "intrinsics.txt: is not a 3x3 matrix"),
-    ("sun3d", put("extrinsics/20140808220511.txt", "x"), (), "20140808220511.txt: is not a table of"),
+    ("sun3d", put("extrinsics/20140808220511.txt", "x"), (), "0511.txt: is not a table of"),
     ("replica", put("results/depth000001.png", b""), (1,), "depth000001.png: is empty"),
     ("pcd", put("0.pcd", "This is no point cloud.\n" * 100), (0,), "is not a PCD file"),
     ("ply", put("timestamps.txt", "0.5\n"), REFUSED, "timestamps.txt"),
