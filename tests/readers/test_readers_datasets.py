@@ -295,7 +295,7 @@ def test_colour_of_camera_in_given_camera_json(tmp_path: Path) -> None:
         write_png(path, np.dstack([np.tile(np.arange(320) // 2, (240, 1))] * 3).astype(np.uint8))
     recording = open_recording(tmp_path)
     assert [frame.color_image for frame in recording] == [None] * 3
-    assert "3 frames are used without colour" in recording.warnings[-1]
+    assert "colour can't be read in 3 frames" in recording.warnings[-1]
     assert "pass its camera in camera.json" in recording.warnings[-1]
     lens = {"width": 320, "height": 240, "fx": 300.0, "fy": 300.0, "cx": 159.5, "cy": 119.5}
     camera = {"schema": 1, "model": "pinhole", "width": 640, "height": 480}

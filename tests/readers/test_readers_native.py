@@ -381,7 +381,7 @@ def test_frames_with_damaged_colour_are_used_without_it(tmp_path: Path) -> None:
         colors = [frame.color_image is not None for frame in recording]
         assert colors == [True] * 5 + [False] * 3
     (note,) = set(recording.warnings) - set(notes)
-    assert note.startswith("3 frames are used without colour")
+    assert note.startswith("colour can't be read in 3 frames")
     assert "color/000001.png: is empty" in note
     np.testing.assert_array_equal(recording[6].depth, recording[2].depth)
 

@@ -102,9 +102,10 @@ class FileSource(ABC):
                 self._unread_colors[index] = str(error)
                 first = self._unread_colors[min(self._unread_colors)]
                 others = [line for line in self.warnings if line is not self._unread_note]
+                count = len(self._unread_colors)
                 self._unread_note = (
-                    f"{len(self._unread_colors)} frames are used without colour, as it can't be "
-                    f"read, the first: {first}"
+                    f"colour can't be read in {count} frame{'' if count == 1 else 's'}, which "
+                    f"{'is' if count == 1 else 'are'} used without, the first: {first}"
                 )
                 self.warnings[:] = [*others, self._unread_note]
             return None
