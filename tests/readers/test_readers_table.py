@@ -253,7 +253,7 @@ DAMAGED: list[tuple[str, Change, str | tuple[int, ...], str]] = [
     ("tum", cut(99, "rgb/1305031102.160000.png"), (), "colour can't be read in 1 frame"),
     ("3dscannerapp", put("frame_00001.jpg", b""), (), "frame_00001.jpg: is empty"),
     ("3dscannerapp", put("conf_00001.png", b""), (1,), "conf_00001.png: is empty"),
-    ("arkitscenes", put("lowres_wide/41048190_3418.428.png", b""), (), "without colour"),
+    ("arkitscenes", put("lowres_wide/41048190_3418.428.png", b""), (), "used without"),
     ("record3d", put("rgb/1.jpg", b""), (), "rgb/1.jpg: is empty"),
     ("nerfstudio", put("images/frame_1.jpg", b""), (), "frame_1.jpg: is empty"),
     ("scannet", put("color/1.jpg", b""), (), "color/1.jpg: is empty"),
