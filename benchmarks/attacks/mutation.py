@@ -58,6 +58,7 @@ class Subject:
 def subjects() -> dict[str, Subject]:
     """Return all subjects by name, except those whose optional packages are missing."""
     import made_exports
+    import made_recordings
     from camera_files import MAKERS, OTHERS
 
     found = {}
@@ -65,6 +66,8 @@ def subjects() -> dict[str, Subject]:
         inside = f"freiburg1/{file}" if file else "freiburg1"
         found[name] = Subject(_in(make, inside), _recording(inside, format_))
     found["redwood"] = Subject(_redwood, _recording("freiburg1", "redwood"))
+    made = _in(made_recordings.make_bundlefusion, "original")
+    found["bundlefusion"] = Subject(made, _recording("original", "7scenes"))
     found["tiff"] = _with_camera(made_exports.make_tiff3d, "original", "tiff")
     found["depth png"] = _with_camera(_depth_png, "original/a.png", "depth-png")
     for name in ("blaze", "royale"):

@@ -73,6 +73,26 @@ def make_7scenes(folder: Path) -> None:
         write_png(stem.with_name(stem.name + ".color.png"), np.full((480, 640, 3), k, np.uint8))
 
 
+BUNDLEFUSION_INFO = """m_versionNumber = 4
+m_sensorName = StructureSensor
+m_colorWidth = 320
+m_colorHeight = 240
+m_depthWidth = 640
+m_depthHeight = 480
+m_depthShift = 5000
+m_calibrationColorIntrinsic = 290 0 160 0 0 290 120 0 0 0 1 0 0 0 0 1
+m_calibrationColorExtrinsic = 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1
+m_calibrationDepthIntrinsic = 583 0 320 0 0 584 240 0 0 0 1 0 0 0 0 1
+m_calibrationDepthExtrinsic = 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1
+m_frames.size = 3
+"""
+
+
+def make_bundlefusion(folder: Path) -> None:
+    make_7scenes(folder)
+    (folder / "info.txt").write_text(BUNDLEFUSION_INFO)
+
+
 def make_redwood(folder: Path, color: str = "color") -> None:
     for name in ("depth", color):
         (folder / name).mkdir(parents=True)

@@ -10,6 +10,7 @@ import pytest
 
 from made_dumps import pgm_bytes
 from made_recordings import (
+    BUNDLEFUSION_INFO,
     CAMERA,
     COUNTS,
     POSES,
@@ -157,21 +158,6 @@ def test_7scenes(tmp_path: Path) -> None:
     assert frame.camera == Pinhole(640, 480, 500.0, 510.0, 320.0, 240.0)
 
 
-INFO = """m_versionNumber = 4
-m_sensorName = StructureSensor
-m_colorWidth = 320
-m_colorHeight = 240
-m_depthWidth = 640
-m_depthHeight = 480
-m_depthShift = 5000
-m_calibrationColorIntrinsic = 290 0 160 0 0 290 120 0 0 0 1 0 0 0 0 1
-m_calibrationColorExtrinsic = 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1
-m_calibrationDepthIntrinsic = 583 0 320 0 0 584 240 0 0 0 1 0 0 0 0 1
-m_calibrationDepthExtrinsic = 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1
-m_frames.size = 3
-"""
-
-
 @pytest.mark.parametrize("place", ["apt0", "office2/data"], ids=["BundleFusion", "12-Scenes"])
 def test_cameras_in_info_file(tmp_path: Path, place: str) -> None:
     """Beside the frames, or above; colour has its own camera there."""
@@ -179,7 +165,7 @@ def test_cameras_in_info_file(tmp_path: Path, place: str) -> None:
     for path in (tmp_path / place).glob("*.color.png"):
         write_png(path, np.full((240, 320, 3), 77, np.uint8))
     info = tmp_path / place.split("/")[0] / "info.txt"
-    info.write_text(INFO)
+    info.write_text(BUNDLEFUSION_INFO)
     recording = open_recording(tmp_path / place)
     frame = recording[1]
     assert frame.camera == Pinhole(640, 480, 583.0, 584.0, 320.0, 240.0)
@@ -194,7 +180,7 @@ def test_cameras_in_info_file(tmp_path: Path, place: str) -> None:
         path.with_suffix(".pgm").write_bytes(pgm_bytes(counts))
         path.unlink()
     np.testing.assert_array_equal(open_recording(tmp_path / place)[1].depth, frame.depth)
-    info.write_text(INFO.replace("583 0", "wide 0"))
+    info.write_text(BUNDLEFUSION_INFO.replace("583 0", "wide 0"))
     with pytest.raises(InputError, match=r"info\.txt: m_calibrationDepthIntrinsic: is missing, or"):
         open_recording(tmp_path / place)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.apps.mirrors.openings import Opening, find_openings, find_planes
 from tofuse.apps.mirrors.reflection import Evidence, weigh
-from tofuse.apps.mirrors.views import Noise, View, read_views
+from tofuse.apps.mirrors.views import Noise, View, views_of
 from tofuse.engine.arrays import Bool, Float32, Float64
 from tofuse.engine.frames import Recording, evenly_spaced
 from tofuse.engine.fusion import Cloud
@@ -37,7 +37,7 @@ def find_mirrors(recording: Recording, result: Reconstruction, seed: int = 0) ->
     seed
         Of the sampling.
     """
-    views = read_views(recording, result) if result.has_pose.any() else []
+    views = views_of(recording, result) if result.has_pose.any() else []
     cloud = result.cloud
     if not views or cloud.normals is None or not len(cloud):
         return result

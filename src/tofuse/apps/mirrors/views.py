@@ -84,7 +84,7 @@ def wrapped(difference: Float64, ambiguity_m: Float64 | float) -> Float64:
     return difference - periods * np.where(np.isfinite(ambiguity_m), ambiguity_m, 0.0)
 
 
-def read_views(recording: Recording, result: Reconstruction) -> list[View]:
+def views_of(recording: Recording, result: Reconstruction) -> list[View]:
     """Read evenly spaced frames that have a pose."""
     correctors = CameraErrors.made_with(result.config)
     views = []
