@@ -14,7 +14,7 @@ SHOWN_AS: dict[str, str] = {}
 
 def shown(text: str) -> str:
     """Return a message for the user, without the names of temporary folders."""
-    for folder, path in SHOWN_AS.items():
+    for folder, path in list(SHOWN_AS.items()):  # another thread may add one
         text = text.replace(folder, path)
     return text
 
