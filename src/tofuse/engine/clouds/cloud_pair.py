@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -305,16 +306,14 @@ def _registered_views(
     proposed, found = _proposed(views, start, guessed=guess is not None)
     poses += proposed
     best = _best(views, poses, found, local, guess, certain)
-    more = [] if found is None else [c.T_target_source for c in found.poses[:_MANY_REFINED]]
-    more = more[_MAX_REFINED:]
+    more = [] if found is None else found.poses[_MAX_REFINED:_MANY_REFINED]
     if (best.probability or 0.0) >= _LIKELY:
-        chosen = best.T_target_source
-        if any(views.are_distinct_poses(pose.T_target_source, chosen) for pose in proposed):
-            more = []
-        else:  # without a rival, its lead is unknown
-            more = [T for T in more if views.are_distinct_poses(T, chosen)]
+        is_rival = partial(views.are_distinct_poses, best.T_target_source)
+        # Without a rival, its lead is unknown.
+        has_rival = any(is_rival(pose.T_target_source) for pose in proposed)
+        more = [] if has_rival else [c for c in more if is_rival(c.T_target_source)]
     if more:
-        poses += [views.refined(T) for T in more]
+        poses += [views.refined(c.T_target_source) for c in more]
         best = _best(views, poses, found, local, guess, certain)
     return views.with_information(best)
 

@@ -7,7 +7,7 @@ matched by one and the same shift. The correlation of both clouds shows these sh
 from __future__ import annotations
 
 import numpy as np
-from scipy import fft
+import scipy  # loads its parts when they are used
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds.cloud_agreement import CloudMap
@@ -47,8 +47,9 @@ def shifts(
     for points, share in zip(clouds, (source.surface_share, target.surface_share), strict=True):
         grid = np.zeros(shape, np.float32)
         np.add.at(grid, tuple(((points - low) / cell).astype(np.intp).T), share)
-        spectra.append(fft.rfftn(grid))
-    correlation = fft.fftshift(fft.irfftn(np.conj(spectra[0]) * spectra[1], shape))
+        spectra.append(scipy.fft.rfftn(grid))
+    product = np.conj(spectra[0]) * spectra[1]
+    correlation = scipy.fft.fftshift(scipy.fft.irfftn(product, shape))
     origin = np.array(shape) // 2
     reach = int(distinct_m / cell) + 1
     peak, found = origin, []
