@@ -386,6 +386,28 @@ def checked_lens(
         return cls(size[0], size[1], **values)
 
 
+def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> Float64:
+    """Return the matrix (3, 3) of focal lengths and principal point, in pixels."""
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def depth_unit(counts_per_metre: float, where: str | Path) -> float:
+    """Return the metres of one count of depth.
+
+    Raises
+    ------
+    InputError
+        Naming `where`, if it is no plausible number of counts in a metre.
+    """
+    if not 10 <= counts_per_metre <= 1e6:
+        raise InputError(
+            f"is {counts_per_metre:g}, which are no counts of depth in a metre",
+            where=where,
+            remedy="write the counts of depth in a metre, such as 1000",
+        )
+    return 1 / counts_per_metre
+
+
 def checked_pinhole(K: Float64, size: tuple[int, int], where: str | Path) -> Pinhole:
     """Return the camera of a matrix from a file.
 

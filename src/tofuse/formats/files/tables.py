@@ -67,6 +67,20 @@ def read_numbers(path: str | Path) -> Float64:
     return parse_numbers(read_text(path), path)
 
 
+def read_3x3(path: str | Path, remedy: str) -> Float64:
+    """Read a file with a 3x3 matrix, one row a line.
+
+    Raises
+    ------
+    InputError
+        If it holds anything else; with the `remedy`.
+    """
+    K = read_numbers(path)
+    if K.shape != (3, 3):
+        raise InputError("is not a 3x3 matrix", where=path, remedy=remedy)
+    return K
+
+
 def read_columns(path: str | Path) -> dict[str, Float64]:
     """Read a CSV file with a header line: (N,) numbers by column name.
 

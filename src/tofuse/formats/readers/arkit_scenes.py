@@ -85,7 +85,7 @@ def _lens(file: Path, lens: Path | None, size: tuple[int, int]) -> Pinhole:
     if table.shape != (1, 6):
         raise InputError("is not w h fx fy cx cy", where=lens, remedy="download it again")
     width, height, fx, fy, cx, cy = table[0]
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    K = camera_file.intrinsic_matrix(fx, fy, cx, cy)
     return phones.phone_lens(K, camera_file.image_size(width, height, lens), size, lens)
 
 

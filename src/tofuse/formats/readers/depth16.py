@@ -10,8 +10,8 @@ from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
-from tofuse.formats.images import read_color, read_raw
-from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, pixels
+from tofuse.formats.images import read_raw
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs
 
 _SUFFIXES = ("_depth16.bin", ".depth16")
 _BITS = 13
@@ -64,16 +64,11 @@ class Depth16Source(FileSource):
         # 0 means unknown and counts as full confidence; 1 is 0 %, 7 is 6/7.
         level = (samples >> _BITS).astype(np.uint8)
         confidence = np.where(level == 0, np.uint8(CONFIDENCE_MAX), level - np.uint8(1))
-        color = self.color[index]
         return self.image(
             index,
             depth,
             confidence_image=confidence.astype(np.uint8),
-            color_image=None
-            if color is None
-            else self.color_if_readable(
-                index, lambda: pixels.resized(read_color(color), size, color)
-            ),
+            color_image=self.color_from_file(index, self.color[index], size),
         )
 
 

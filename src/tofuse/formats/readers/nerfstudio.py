@@ -24,7 +24,6 @@ from tofuse.formats.sources import (
     ReaderOptions,
     Sniff,
     inputs,
-    pixels,
 )
 
 NAMES = ("transforms.json", "transforms_train.json")
@@ -107,7 +106,6 @@ class NerfstudioSource(FileSource):
         depth = self._depth(path)
         size = (depth.shape[1], depth.shape[0])
         camera = frame.lens(size)
-        color = frame.image()
         sigma = frame.path("sigma_file_path")
         sigma_image = None
         if sigma is not None:
@@ -118,11 +116,7 @@ class NerfstudioSource(FileSource):
             index,
             depth,
             camera=camera,
-            color_image=None
-            if color is None
-            else self.color_if_readable(
-                index, lambda: pixels.resized(read_color(color), size, color)
-            ),
+            color_image=self.color_from_file(index, frame.image(), size),
             sigma_image=sigma_image,
         )
 

@@ -117,7 +117,7 @@ def _lens(metadata: dict[str, Any], size: tuple[int, int], path: Path) -> Pinhol
     fx, fy, cx, cy, width, height = _numbers(
         metadata, ("fx", "fy", "cx", "cy", "width", "height"), path
     )
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    K = camera_file.intrinsic_matrix(fx, fy, cx, cy)
     return phones.phone_lens(K, camera_file.image_size(width, height, f"{path}: width"), size, path)
 
 

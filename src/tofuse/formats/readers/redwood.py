@@ -129,15 +129,10 @@ def _read_camera(path: Path, sensor: str) -> _Camera:
     lens = camera_file.checked_pinhole(K, camera_file.image_size(width, height, path), path)
     # Open3D's readers of bags add these; other programs write the matrix alone.
     counts_per_metre = reading.number_in(data, "depth_scale", path, 1000.0)
-    if not 10 <= counts_per_metre <= 1e6:
-        raise InputError(
-            f"is {counts_per_metre:g}",
-            where=f"{path}: depth_scale",
-            remedy="write the counts of depth in a metre, such as 1000",
-        )
+    unit = camera_file.depth_unit(counts_per_metre, f"{path}: depth_scale")
     rate = reading.number_in(data, "fps", path, 1.0)
     sensor = str(data.get("device_name") or sensor)
-    return _Camera(lens, sensor, 1 / counts_per_metre, rate if 0.01 <= rate <= 1e4 else 1.0)
+    return _Camera(lens, sensor, unit, rate if 0.01 <= rate <= 1e4 else 1.0)
 
 
 def timestamps(files: list[Path]) -> Float64 | None:

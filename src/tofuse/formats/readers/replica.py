@@ -82,9 +82,7 @@ def _read_camera(path: Path) -> tuple[Pinhole, float]:
         reading.number_in(data, name, f"{file}: camera", remedy=_REMEDY)
         for name in ("fx", "fy", "cx", "cy", "w", "h", "scale")
     )
-    if not 10 <= scale <= 1e6:
-        problem = f"is {scale:g}, which are no counts of depth in a metre"
-        raise InputError(problem, where=f"{file}: scale", remedy=_REMEDY)
+    unit = camera_file.depth_unit(scale, f"{file}: scale")
     size = camera_file.image_size(width, height, f"{file}: w")
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return camera_file.checked_pinhole(K, size, file), 1 / scale
+    K = camera_file.intrinsic_matrix(fx, fy, cx, cy)
+    return camera_file.checked_pinhole(K, size, file), unit

@@ -105,11 +105,7 @@ def _camera(folder: Path, files: Sequence[Path], default: _Camera, warnings: lis
     for place in (folder, folder.absolute().parent):
         path = place / _INTRINSICS
         if reading.is_file(path):
-            K = tables.read_numbers(path)
-            if K.shape != (3, 3):
-                raise InputError(
-                    "is not a 3x3 matrix", where=path, remedy="write three rows of three"
-                )
+            K = tables.read_3x3(path, "write three rows of three")
             lens = camera_file.checked_pinhole(K, first_size(files), path)
             return replace(default, lens=lens)
         info = reading.first_file(*(place / name for name in _INFO))
@@ -137,13 +133,7 @@ def _read_info(path: Path, warnings: list[str]) -> _Camera:
         K = numbers(f"m_calibration{name}Intrinsic", (-1, 4))
         return camera_file.checked_pinhole(K, size, path)
 
-    counts_per_metre = float(numbers("m_depthShift", ()))
-    if not 10 <= counts_per_metre <= 1e6:
-        raise InputError(
-            f"is {counts_per_metre:g}",
-            where=f"{path}: m_depthShift",
-            remedy="write the counts of depth in a metre, such as 1000",
-        )
+    unit = camera_file.depth_unit(float(numbers("m_depthShift", ())), f"{path}: m_depthShift")
     color = None
     if float(numbers("m_colorWidth", ())):
         T_device_color, T_device_depth = (
@@ -152,4 +142,4 @@ def _read_info(path: Path, warnings: list[str]) -> _Camera:
         T = inputs.color_from_depth(warnings, T_device_color, T_device_depth, path)
         color = camera_file.ColorCamera(lens("Color"), T)
     sensor = " ".join(cells.get("m_sensorName", []))
-    return _Camera(lens("Depth"), sensor, 1 / counts_per_metre, color)
+    return _Camera(lens("Depth"), sensor, unit, color)

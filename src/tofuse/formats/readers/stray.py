@@ -10,6 +10,7 @@ from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
+from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading, tables
 from tofuse.formats.images import Video, first_size
 from tofuse.formats.sources import (
@@ -157,9 +158,7 @@ class StraySource(phones.PhoneSource):
         image = phones.IMAGE_SIZE if self.video is None else (self.video.width, self.video.height)
         if reading.is_file(folder / "camera_matrix.csv"):
             path = folder / "camera_matrix.csv"
-            K = tables.read_numbers(path)
-            if K.shape != (3, 3):
-                raise InputError("is not a 3x3 matrix", where=path, remedy="copy it again")
+            K = tables.read_3x3(path, "copy it again")
             common = phones.phone_lens(K, image, size, path)
             self.cameras = [common] * len(row)
         elif not all(name in columns for name in _LENS):
@@ -173,7 +172,7 @@ class StraySource(phones.PhoneSource):
         if all(name in columns for name in _LENS):
             for k in np.flatnonzero(row >= 0):
                 fx, fy, cx, cy = (columns[name][row[k]] for name in _LENS)
-                K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+                K = camera_file.intrinsic_matrix(fx, fy, cx, cy)
                 try:
                     self.cameras[k] = phones.phone_lens(
                         K, image, size, f"{folder / 'odometry.csv'}, frame {k}"

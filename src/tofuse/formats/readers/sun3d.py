@@ -68,10 +68,7 @@ def _read(path: Path) -> UInt16:
 
 
 def _lens(path: Path, size: tuple[int, int]) -> Pinhole:
-    K = tables.read_numbers(path)
-    if K.shape != (3, 3):
-        raise InputError("is not a 3x3 matrix", where=path, remedy="download it again")
-    return camera_file.checked_pinhole(K, size, path)
+    return camera_file.checked_pinhole(tables.read_3x3(path, "download it again"), size, path)
 
 
 def _check_rotated(stored: UInt16, folder: Path) -> None:

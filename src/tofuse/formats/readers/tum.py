@@ -119,7 +119,7 @@ def _calibrated(path: Path, files: list[Path]) -> Pinhole | None:
     if table.shape != (1, 4):
         raise InputError("is not one line of fx fy cx cy", where=path, remedy="correct it there")
     fx, fy, cx, cy = table[0]
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    K = camera_file.intrinsic_matrix(fx, fy, cx, cy)
     return camera_file.checked_pinhole(K, first_size(files), path)
 
 

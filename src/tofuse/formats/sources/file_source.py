@@ -23,7 +23,7 @@ from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import check_first_size, read_color, read_image
 from tofuse.formats.sources.inputs import read_timestamps, tum_poses
-from tofuse.formats.sources.pixels import sampled_color
+from tofuse.formats.sources.pixels import resized, sampled_color
 from tofuse.formats.sources.reader import ReaderOptions
 
 
@@ -109,6 +109,15 @@ class FileSource(ABC):
                 )
                 self.warnings[:] = [*others, self._unread_note]
             return None
+
+    def color_from_file(self, index: int, path: Path | None, size: tuple[int, int]) -> UInt8 | None:
+        """Return the colour of a frame, of an image that has the view of depth.
+
+        Downscaled to the `size` (width, height) of depth; None without a readable file.
+        """
+        if path is None:
+            return None
+        return self.color_if_readable(index, lambda: resized(read_color(path), size, path))
 
     def full_resolution_color(self, index: int) -> UInt8 | None:
         """Return the colour of a frame at its recorded resolution, if it has the view of depth.
