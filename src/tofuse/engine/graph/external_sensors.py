@@ -37,6 +37,8 @@ _DEGREES = 30.0
 _SPREAD = np.log(2.0)
 # Least factor on the errors of odometry: over short motions a phone's are smaller than stated.
 _BETTER = 0.5
+# Iterations of the robust estimate of odometry's scale.
+_ROBUST_ITERATIONS = 5
 # Odometry that fewer fully constrained registrations were compared with is not verified.
 _MIN_COMPARED = 10
 # Squared disagreement, in units of tracking's errors, that one in a hundred motions of independent
@@ -256,11 +258,11 @@ class GravityEdges(Bounded, ExternalSensor):
 class OdometryEdges(Bounded, ExternalSensor):
     """Connects consecutive frames by the motion between their poses in an odometry file.
 
-    Its errors are random walks over time, length and angle. They are scaled until these and the
-    errors of tracking explain the disagreement of the two; single steps with a far larger one are
-    rejected. Odometry that agrees with tracking better than the errors of tracking allow shares
-    them, as if it were computed from the same depth. Then it is no evidence, except where the
-    depth has none.
+    Its errors are a scale, corrected by comparison with tracking, and random walks over time,
+    length and angle. These are scaled until they and the errors of tracking explain the
+    disagreement of the two; single steps with a far larger one are rejected. Odometry that agrees
+    with tracking better than the errors of tracking allow shares them, as if it were computed from
+    the same depth. Then it is no evidence, except where the depth has none.
 
     Attributes
     ----------
@@ -268,6 +270,8 @@ class OdometryEdges(Bounded, ExternalSensor):
         Standard deviation after one second.
     relative, relative_rad
         Additional standard deviation after one metre, as a fraction; and after one radian.
+    scale
+        Usual error of all lengths together, as a fraction: the scale of a Cauchy distribution.
     limit
         Largest factor on its errors; odometry that needs more is not used.
     gate
@@ -278,6 +282,7 @@ class OdometryEdges(Bounded, ExternalSensor):
     drift_rad: Annotated[float, Bounds(1e-6, 10)] = 0.001
     relative: Annotated[float, Bounds(0, 10)] = 0.01
     relative_rad: Annotated[float, Bounds(0, 10)] = 0.003
+    scale: Annotated[float, Bounds(0, 1)] = 0.02
     limit: Annotated[float, Bounds(1)] = 5.0
     gate: Annotated[float, Bounds(0, exclusive=True)] = 40.0
 
@@ -291,25 +296,32 @@ class OdometryEdges(Bounded, ExternalSensor):
         measured = se3.inverse(sensed.odometry[first]) @ sensed.odometry[first + 1]
         variances = self._variances(measured, sensed.times[first + 1] - sensed.times[first])
         compared = _compare(sensed, graph, variances, first)
-        scales = (
-            np.ones((2, 2))
+        fit = (
+            _Fit(np.ones((2, 2)), 0.0, self.scale)
             if compared is None
-            else compared.scales((1.0, 1.0), (_BETTER, self.limit))
+            else compared.fit((1.0, 1.0), (_BETTER, self.limit), self.scale)
         )
-        if scales is None:
+        if fit is None:
             text = (
                 f"the odometry differs from the tracked motion by more than {self.limit:g} times "
                 "its errors, so it was not used"
             )
             return SensorPriors(records=(SensorRecord("odometry", len(first), 0, None, text),))
-        odometry_scale = scales[1]
-        C = (variances * np.repeat(odometry_scale**2, 3))[:, :, None] * np.eye(6)
-        stated = (variances * np.repeat(np.maximum(odometry_scale, 1) ** 2, 3))[:, :, None]
+        measured[:, :3, 3] *= 1 - fit.excess
+        # All steps share the error of the scale: along the path it adds up to no more than this.
+        length = np.linalg.norm(measured[:, :3, 3], axis=1)
+        shared_variance = np.zeros_like(variances)
+        shared_variance[:, :3] = (fit.excess_sigma**2 * length.sum() * length)[:, None]
+        factors = fit.factors[1]
+        C = (variances * np.repeat(factors**2, 3) + shared_variance)[:, :, None] * np.eye(6)
+        stated = variances * np.repeat(np.maximum(factors, 1) ** 2, 3) + shared_variance
         tracked = se3.inverse(graph.poses[first]) @ graph.poses[first + 1]
         tracking_covariance = _covariance_to_reference(graph)
         chi2 = _squared(
             se3.log(se3.inverse(tracked) @ measured),
-            stated * np.eye(6) + tracking_covariance[first] + tracking_covariance[first + 1],
+            stated[:, :, None] * np.eye(6)
+            + tracking_covariance[first]
+            + tracking_covariance[first + 1],
         )
         used = chi2 <= self.gate
         shared = compared is not None and compared.shares_errors
@@ -325,19 +337,24 @@ class OdometryEdges(Bounded, ExternalSensor):
             )
             for k in kept
         )
-        scale = float(odometry_scale.max())
+        scale = float(factors.max())
         text = f"{len(kept)} of {len(first)} steps of the odometry are used, "
         text += (
             "with the stated errors"
             if abs(scale - 1) < 0.05
             else f"with {scale:.1f} times its errors"
         )
+        if compared is not None and abs(fit.excess) > 3 * fit.excess_sigma:
+            text += (
+                f"; compared with the depth its lengths are {abs(fit.excess):.1%} too "
+                f"{'long' if fit.excess > 0 else 'short'}, which was corrected"
+            )
         if shared:
             text += (
                 ", those where images don't constrain the motion: it agrees with the tracked "
                 "motion better than the errors of the depth allow, as if it were computed from it"
             )
-        metric = compared is not None and compared.lengths_agree(scales)
+        metric = compared is not None and compared.lengths_agree(fit.factors)
         record = SensorRecord("odometry", len(first), len(kept), scale, text, metric)
         verified = compared is not None and compared.verified
         return SensorPriors(steps, records=(record,), verified=verified)
@@ -351,6 +368,23 @@ class OdometryEdges(Bounded, ExternalSensor):
             self.drift_rad**2 * seconds + self.relative_rad**2 * angle,
         ]
         return np.repeat(np.stack(variance, 1), 3, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """What explains the disagreement of tracking and odometry.
+
+    Attributes
+    ----------
+    factors
+        (2, 2) on the sigmas of registrations and of odometry, each of translation and of rotation.
+    excess, excess_sigma
+        Fraction of odometry's lengths that they exceed tracked ones by, and its sigma.
+    """
+
+    factors: Float64
+    excess: float
+    excess_sigma: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,23 +410,43 @@ class _Comparison:
     spans: Intp
     verified: bool
 
-    def scales(
-        self, registrations: tuple[float, float], odometry: tuple[float, float]
-    ) -> Float64 | None:
-        """Most likely factors on the sigmas of registrations and of odometry (2, 2).
+    def fit(
+        self,
+        registrations: tuple[float, float],
+        odometry: tuple[float, float],
+        scale_error: float = 0.0,
+    ) -> _Fit | None:
+        """Most likely factors on the sigmas and scale; None if they don't explain the disagreement.
 
-        Each of translation and of rotation, within the given limits; None if they don't explain
-        the disagreement.
+        The factors of registrations and of odometry are within the given limits; for `scale_error`
+        see `OdometryEdges.scale`.
         """
-        misfit = self._misfit
+        misfit, along = self._misfit, np.zeros((len(self.spans), 6))
+        along[:, :3] = np.einsum("kji,kj->ki", self.tracked[:, :3, :3], self.odometry[:, :3, 3])
         from scipy.optimize import minimize  # slow to import
 
         weight = 1 / self.spans  # about as many are independent as don't overlap
 
+        def excess(C: Float64) -> tuple[float, float]:
+            if scale_error == 0:
+                return 0.0, 0.0
+            weighted = np.linalg.solve(C, along[..., None])[..., 0]
+            information = weight * (weighted * along).sum(1)
+            measured = weight * (weighted * misfit).sum(1)
+            found, robust, prior = 0.0, np.ones(len(weight)), 0.0
+            for _ in range(_ROBUST_ITERATIONS):
+                prior = 2 / (scale_error**2 + found**2)
+                found = float((robust * measured).sum() / ((robust * information).sum() + prior))
+                robust = (_DEGREES + 6) / (_DEGREES + _squared(misfit - found * along, C))
+            # Motions over different numbers of frames repeat each other.
+            most = max(float(information[self.spans == n].sum()) for n in np.unique(self.spans))
+            return found, (most + prior) ** -0.5
+
         def cost(logarithms: Float64) -> float:
             C = self._covariances(np.exp(logarithms).reshape(2, 2))
+            e = misfit - excess(C)[0] * along
             likelihood = 0.5 * np.linalg.slogdet(C)[1] + 0.5 * (_DEGREES + 6) * np.log1p(
-                _squared(misfit, C) / _DEGREES
+                _squared(e, C) / _DEGREES
             )
             prior = 0.5 * float((logarithms[2:] ** 2).sum()) / _SPREAD**2
             return float((weight * likelihood).sum()) + prior
@@ -400,9 +454,12 @@ class _Comparison:
         low, high = np.log(np.repeat([registrations, odometry], 2, axis=0)).T
         bounds = list(zip(low, high, strict=True))
         fit = minimize(cost, 0.3 * high, method="L-BFGS-B", bounds=bounds)
-        found = np.exp(fit.x).reshape(2, 2)
-        median = float(np.median(_squared(misfit, self._covariances(found))))
-        return found if median <= 2 * MEDIAN else None
+        factors = np.exp(fit.x).reshape(2, 2)
+        C = self._covariances(factors)
+        found = _Fit(factors, *excess(C))
+        median = float(np.median(_squared(misfit - found.excess * along, C)))
+        explained = median <= 2 * MEDIAN and abs(found.excess) <= odometry[1] * scale_error
+        return found if explained else None
 
     def by_length(self) -> Iterator[_Comparison]:
         """Yield those over each number of frames, if there are several."""
@@ -513,8 +570,10 @@ def with_depth_scale(measured: SensorPriors, sensed: SensorData, graph: PoseGrap
     compared = _compare(sensed, graph, variances, first)
     if compared is None:
         return measured
-    found = [part.scales((1.0, _MAX_DEPTH_SCALE), (1.0, 1.0)) for part in compared.by_length()]
-    translation, rotation = np.max([np.ones(2), *(s[0] for s in found if s is not None)], 0)
+    found = [part.fit((1.0, _MAX_DEPTH_SCALE), (1.0, 1.0)) for part in compared.by_length()]
+    translation, rotation = np.max(
+        [np.ones(2), *(fit.factors[0] for fit in found if fit is not None)], 0
+    )
     return replace(measured, depth_scale=(float(translation), float(rotation)))
 
 
