@@ -37,11 +37,9 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.sensor.multipath_correction import Multipath
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
-from tofuse.formats.cameras.calibration_files import corrected_depth
-from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model, noise_of
-from tofuse.lab.simulation.render import render
+from tofuse.lab.simulation.record import RecordingPlan
 from tofuse.lab.world.scene import Scene, build
 
 SUBPIXELS = 3
@@ -166,7 +164,6 @@ def main() -> None:
     arguments = parser.parse_args()
     model = camera_model(arguments.camera)
     effects = Effects(noise=arguments.noise)
-    factory = sensor.factory_correction(model, effects)
     rows: dict[str, list[tuple[str, float, dict[str, float], float, bool]]] = defaultdict(list)
     for seed in range(arguments.first, arguments.first + arguments.seeds):
         for kind in KINDS:
@@ -175,14 +172,14 @@ def main() -> None:
             scene, sequence = build(kind, seed=seed, texture=texture)
             step = int(rng.integers(1, 5))
             first = int(rng.integers(0, sequence.frames - step))
+            raw = np.array([first, first + step])
+            made = RecordingPlan(scene, sequence, model, effects, seed, raw)
             compensation = Multipath().start()
-            poses, views = [], []
-            for index in (first, first + step):
-                raw = render(scene, sequence, model, index, effects=effects, seed=seed).frame
-                depth = corrected_depth(factory, raw.camera, raw.depth, raw.depth_kind)
-                frame = compensation.apply(replace(raw, depth=depth))
-                views.append(prepare_view(frame, SurfaceOptions()))
-                poses.append(sequence.T_room_camera(index / sequence.frame_rate_hz))
+            views = [
+                prepare_view(compensation.apply(frame), SurfaceOptions())
+                for frame in made.corrected_frames()
+            ]
+            poses = [sequence.T_room_camera(index / sequence.frame_rate_hz) for index in raw]
             T = se3.inverse(poses[0]) @ poses[1]
             truths = true_information(scene, model, poses[1], T)
             name = f"{kind} {'textured' if texture else 'uniform'}"

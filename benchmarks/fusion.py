@@ -54,7 +54,6 @@ from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.sensor.multipath_correction import Multipath
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
-from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.lab.experiments.surface_error import Surface, compare_surfaces, distances
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import RecordingPlan, plan
@@ -69,12 +68,7 @@ def simulated(every: int, everything: bool) -> tuple[RecordingPlan, list[RangeFr
     """The plan and its frames, after factory correction."""
     made = plan("room", effects=Effects() if everything else _NOISE)
     made = replace(made, raw=made.raw[::every])
-    frames = []
-    for rendered in made.frames(None):
-        frame = rendered.frame
-        depth = corrected_depth(made.correction, frame.camera, frame.depth, frame.depth_kind)
-        frames.append(replace(frame, depth=depth))
-    return made, frames
+    return made, [*made.corrected_frames()]
 
 
 def seen_by(made: RecordingPlan, masks: list[Bool], frames: list[RangeFrame]) -> Float64:

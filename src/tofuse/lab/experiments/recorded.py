@@ -11,10 +11,9 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.filters import apply_filters
-from tofuse.engine.frames import ArraySource, Frame, RangeFrame, Recording
+from tofuse.engine.frames import ArraySource, Frame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import Config
-from tofuse.formats.cameras import corrected_depth
 from tofuse.lab.simulation import Effects, RecordingPlan, plan
 
 # About 1 cm apart in a room, so that distances are accurate to half of that.
@@ -99,13 +98,7 @@ def record_scene(
     planned = plan(scene, seed=seed, every=1, frames=limit, effects=effects or Effects())
     needed = np.any([planned.raw % stride == 0 for stride in strides], axis=0)
     planned = replace(planned, raw=planned.raw[needed])
-    correction = planned.correction
-
-    def corrected(frame: RangeFrame) -> Frame:
-        depth = corrected_depth(correction, frame.camera, frame.depth, frame.depth_kind)
-        return replace(frame, depth=depth)
-
-    frames = tuple(corrected(rendered.frame) for rendered in planned.frames(progress))
+    frames = tuple(planned.corrected_frames(progress))
     return RecordedScene(planned, frames, planned.poses)
 
 
