@@ -123,7 +123,8 @@ def with_chair(furnish: Furnish, moved: float) -> Furnish:
 
     def furnished(assembly: Assembly, T: Float64, rng: np.random.Generator, room: int) -> None:
         furnish(assembly, T, rng, room)
-        furniture.chair(assembly, flat.FABRICS[3], T @ placed((0.9 + moved, -1.3), 2.2), arms=False)
+        moved_chair = assembly.at(T @ placed((0.9 + moved, -1.3), 2.2))
+        furniture.chair(moved_chair, flat.FABRICS[3], arms=False)
 
     return furnished
 
