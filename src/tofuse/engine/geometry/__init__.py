@@ -3,7 +3,7 @@
 `se3` and `quaternion` work on arrays of poses; `compose`, `retract`, `twist_between` and
 `distance_and_angle` do so for one pose inside kernels. `KdTree` finds nearest neighbours, and
 `PlaceCounts` tells how often a camera has been at a place. `triangles` has their areas and
-closest points.
+points.
 """
 
 from typing import TYPE_CHECKING

@@ -12,7 +12,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.filters import apply_filters
 from tofuse.engine.frames import ArraySource, Frame, Recording
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, triangles
 from tofuse.engine.mapping import Config
 from tofuse.lab.simulation import Effects, RecordingPlan, plan
 
@@ -63,7 +63,8 @@ class RecordedScene:
     def surface(self) -> Float64:
         """(K, 3) random points on the true surface, in its own frame (z up), m."""
         vertices, faces = self.plan.scene.truth_mesh()
-        return sample_surface(vertices[faces], _SURFACE_POINTS)
+        rng = np.random.default_rng([0, _SURFACE_POINTS])
+        return triangles.random_points(vertices[faces], _SURFACE_POINTS, rng)
 
     @cached_property
     def surface_tree(self) -> Any:
@@ -100,15 +101,3 @@ def record_scene(
     planned = replace(planned, raw=planned.raw[needed])
     frames = tuple(planned.corrected_frames(progress))
     return RecordedScene(planned, frames, planned.poses)
-
-
-def sample_surface(triangles: Float64, count: int) -> Float64:
-    """Sample points (count, 3) uniformly from triangles (F, 3, 3), with a fixed seed."""
-    a, b, c = np.swapaxes(triangles, 0, 1)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    rng = np.random.default_rng([0, count])
-    face = rng.choice(len(triangles), count, p=area / area.sum())
-    u, v = rng.random((2, count, 1))
-    flip = u + v > 1
-    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
-    return a[face] + u * (b - a)[face] + v * (c - a)[face]
