@@ -31,7 +31,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from tofuse.apps.jobs import Options, run
-from tofuse.engine.cameras import Pinhole
+from tofuse.engine.cameras import Pinhole, homogeneous
 from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.fusion import Mesh, Textured, drawing
 from tofuse.engine.fusion.display_surface import TOLERANCE_FRACTION, TOLERANCE_M
@@ -240,7 +240,7 @@ def _aligned(
         rows, columns = rows[some], columns[some]
         pixels = (np.c_[columns, rows] + 0.5) / scale - 0.5
         at = _rays_at(camera, pixels)
-        points = np.c_[at, np.ones(len(at))] * z[rows, columns][:, None]
+        points = homogeneous(at) * z[rows, columns][:, None]
         target = pixels + moved[rows, columns] / scale
 
         def residuals(xi: np.ndarray, p: Any = points, target: Any = target) -> np.ndarray:
@@ -282,7 +282,7 @@ def rendered(
     T = se3.inverse(T_world_camera)
     p = mesh.vertices.astype(float) @ T[:3, :3].T + T[:3, 3]
     z = np.maximum(p[:, 2], 1e-6)
-    pixels = (camera.project(np.c_[p[:, :2] / z[:, None], np.ones(len(p))]) + 0.5) * [
+    pixels = (camera.project(homogeneous(p[:, :2] / z[:, None])) + 0.5) * [
         size[0] / camera.width,
         size[1] / camera.height,
     ] - 0.5

@@ -32,7 +32,7 @@ from covariance import KINDS
 from tofuse.engine.alignment.projective import UNITS, Level, ProjectiveOptions, Target, align
 from tofuse.engine.alignment.uncertainty import covariance
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.cameras.cameras import ray_lengths
+from tofuse.engine.cameras.cameras import homogeneous, ray_lengths, unit_rays
 from tofuse.engine.geometry import se3
 from tofuse.engine.sensor.multipath_correction import Multipath
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
@@ -60,8 +60,7 @@ def true_information(
     R, origin = T_room_source[:3, :3], T_room_source[:3, 3]
 
     def cast(x: Float64, y: Float64) -> tuple[Float64, Float64, Float64]:
-        ray = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
-        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        ray = unit_rays(np.stack([x, y], -1).reshape(-1, 2))
         hits = scene.cast(origin, ray @ R.T)
         shape = x.shape
         normal = hits.normal.astype(float) @ R
@@ -75,9 +74,7 @@ def true_information(
 
     seen = np.isfinite(distance) & (distance < model.ambiguity_m)
     distance = np.where(seen, distance, 1.0)
-    points = (
-        np.concatenate([rays, np.ones((height, width, 1))], -1) * (distance / lengths)[..., None]
-    )
+    points = homogeneous(rays) * (distance / lengths)[..., None]
     cosine = np.abs((normal * points).sum(-1)) / distance
     moved = se3.transform(T_target_source, points.reshape(-1, 3)).reshape(points.shape)
     pixel = camera.project(moved)

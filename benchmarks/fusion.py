@@ -37,6 +37,7 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.cameras.cameras import unit_rays
 from tofuse.engine.compute.spill import Spill
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.filters.base import apply_filters
@@ -77,8 +78,7 @@ def seen_by(made: RecordingPlan, masks: list[Bool], frames: list[RangeFrame]) ->
     rate = made.sequence.frame_rate_hz
     for raw, T_world, mask, frame in zip(made.raw, made.poses, masks, frames, strict=True):
         T = made.sequence.T_room_camera(raw / rate)
-        d = np.insert(frame.camera.rays()[mask].astype(float), 2, 1, -1)
-        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        d = unit_rays(frame.camera.rays()[mask])
         hits = made.scene.cast(T[:3, 3], d @ T[:3, :3].T)
         points = se3.transform(T_world, d * hits.distance[:, None].astype(float))
         seen.append(points[np.isfinite(points).all(1)])
@@ -140,8 +140,7 @@ def around_the_room(
     made = plan(scene)
     camera = made.model.camera
     shape = camera.rays().shape[:2]
-    rays = np.insert(camera.rays().reshape(-1, 2).astype(float), 2, 1, -1)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = unit_rays(camera.rays().reshape(-1, 2))
     for k in range(count):
         rng = np.random.default_rng([seed, k])
         time_s = made.raw[step * k % len(made.raw)] / made.sequence.frame_rate_hz

@@ -27,6 +27,7 @@ import numpy as np
 
 import sequences
 from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.cameras.cameras import unit_rays
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import Recording
@@ -141,8 +142,7 @@ def measured(walk: Walk, recording: Recording) -> Places:
     for raw, T_world, frame in zip(walk.plan.raw, walk.plan.poses, recording, strict=True):
         assert isinstance(frame, RangeFrame)
         T = sequence.T_room_camera(raw / sequence.frame_rate_hz)
-        rays = np.insert(frame.camera.rays()[frame.valid].astype(float), 2, 1, -1)
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        rays = unit_rays(frame.camera.rays()[frame.valid])
         hits = scene.cast(T[:3, 3], rays @ T[:3, :3].T)
         hit = np.isfinite(hits.distance)
         at = se3.transform(T_world, rays[hit] * hits.distance[hit, None].astype(float))

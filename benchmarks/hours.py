@@ -36,7 +36,7 @@ from scipy.interpolate import PchipInterpolator
 
 from tofuse.apps.results.run_json import frames_in_main_model
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.cameras.cameras import Pinhole, homogeneous
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
@@ -256,10 +256,7 @@ def image_of(
     scene: Scene, camera: Pinhole, T: Float64, k: int, rng: np.random.Generator
 ) -> RangeFrame:
     """Image `k` of a camera with noise, at a pose (4, 4)."""
-    rays = np.concatenate(
-        [camera.rays().astype(float), np.ones((camera.height, camera.width, 1))], -1
-    )
-    rays = rays.reshape(-1, 3)
+    rays = homogeneous(camera.rays().reshape(-1, 2))
     lengths = np.linalg.norm(rays, axis=1)
     directions = rays / lengths[:, None] @ T[:3, :3].T
     hits = scene.cast(T[:3, 3], directions)

@@ -34,7 +34,7 @@ import numpy as np
 
 from tofuse.apps.jobs.run_options import Options, resolve
 from tofuse.engine.arrays import Bool, Float32, Float64
-from tofuse.engine.cameras.cameras import ray_lengths
+from tofuse.engine.cameras.cameras import homogeneous, ray_lengths
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
@@ -113,8 +113,7 @@ def planes_of(depth: Float32, frame: RangeFrame) -> list[Bool]:
 
     Pixels on one plane have the same normal.
     """
-    rays = frame.camera.rays().astype(float)
-    points = np.concatenate([rays, np.ones((*depth.shape, 1))], -1) * depth[..., None]
+    points = homogeneous(frame.camera.rays()) * depth[..., None]
     down, right = np.gradient(points, axis=(0, 1))
     normals = np.cross(right, down)
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)

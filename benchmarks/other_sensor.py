@@ -17,7 +17,7 @@ import numpy as np
 
 import unusual
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.cameras.cameras import Pinhole, homogeneous
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
@@ -263,7 +263,7 @@ class _Images:
         fine = Pinhole(
             2 * s.width, 2 * s.height, 2 * c.fx, 2 * c.fy, 2 * c.cx + 0.5, 2 * c.cy + 0.5
         )
-        rays = np.concatenate([fine.rays(), np.ones((*fine.rays().shape[:2], 1))], 2)
+        rays = homogeneous(fine.rays())
         self.z_of_range = 1 / np.linalg.norm(rays, axis=2)
         self.rays = rays * self.z_of_range[..., None]
 

@@ -36,7 +36,7 @@ from scipy.optimize import least_squares
 import sequences
 from fusion import views_of
 from tofuse.engine.arrays import Float32, Float64, Intp
-from tofuse.engine.cameras import scaled
+from tofuse.engine.cameras import homogeneous, scaled
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import Recording, evenly_spaced
 from tofuse.engine.fusion import display_surface
@@ -155,8 +155,7 @@ def _fit(a: Float64, b: Float64, chosen: Intp, focal: float) -> _Solution | None
     if E is None or E.shape != (3, 3):
         return None
     _, R, t, _ = cv2.recoverPose(E, a[chosen], b[chosen], np.eye(3), mask=mask)
-    ones = np.ones((len(a), 1))
-    h_a, h_b = np.hstack([a, ones]), np.hstack([b, ones])
+    h_a, h_b = homogeneous(a), homogeneous(b)
 
     def residuals(x: Float64) -> Float64:
         E = se3.hat(x[3:] / np.linalg.norm(x[3:])) @ cv2.Rodrigues(x[:3])[0]

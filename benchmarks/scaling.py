@@ -44,7 +44,7 @@ import hours
 import tofuse
 from stages import grouped
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.cameras.cameras import Pinhole, homogeneous
 from tofuse.engine.compute.thread_pool import run_chunks
 from tofuse.engine.compute.thread_pool import threads as using_threads
 from tofuse.engine.frames.frames import RangeFrame
@@ -67,8 +67,7 @@ def made_frames(columns: int, count: int) -> list[RangeFrame]:
     """Frames of a room of 5 x 4 x 3 m with two boxes, with 2 mm of noise at 1 m."""
     rows = columns * 3 // 4
     camera = Pinhole(columns, rows, 0.9 * columns, 0.9 * columns, columns / 2 - 0.5, rows / 2 - 0.5)
-    rays = camera.rays().astype(float)
-    directions = np.concatenate([rays, np.ones((rows, columns, 1))], -1).reshape(-1, 3)
+    directions = homogeneous(camera.rays().reshape(-1, 2))
     frames = []
     for k in range(count):
         T = made_pose(k)

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from scoring import Truth
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.cameras.cameras import BrownConrady
+from tofuse.engine.cameras.cameras import BrownConrady, homogeneous
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
@@ -243,7 +243,7 @@ def groups(frames: Sequence[RangeFrame], poses: Float64, unusable: Sequence[int]
         xy = frame.camera.rays()[pick].reshape(-1, 2).astype(float)
         flat = z[pick].reshape(-1)
         good = (flat > 0) & np.isfinite(xy).all(1)
-        clouds.append(np.column_stack([xy[good], np.ones(good.sum())]) * flat[good, None])
+        clouds.append(homogeneous(xy[good]) * flat[good, None])
         images.append(z)
     fraction = np.zeros((n, n))
     seeing = [k for k in range(n) if k not in set(unusable) and len(clouds[k]) > 20]

@@ -12,7 +12,7 @@ from tofuse.apps.calibration.board import Board
 from tofuse.apps.calibration.depth import DepthFit, calibrate_depth
 from tofuse.apps.calibration.plane_views import PlaneView, board_planes, scene_planes
 from tofuse.apps.cli.program import main
-from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.cameras.cameras import Pinhole, unit_rays
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.recording import Recording
 from tofuse.formats.cameras.calibration_files import read_correction
@@ -43,8 +43,7 @@ def own_offsets() -> np.ndarray:
 def made_views(*, known: bool, constant: float = 0.0) -> list[PlaneView]:
     """Planes from 0.8 to 4 m, tilted in all directions."""
     rng = np.random.default_rng(7)
-    rays = np.concatenate([CAMERA.rays(), np.ones((36, 48, 1))], -1).reshape(-1, 3).astype(float)
-    directions = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    directions = unit_rays(CAMERA.rays().reshape(-1, 2))
     views = []
     for k, distance in enumerate(np.linspace(0.8, 4.0, 40)):
         tilt, around = rng.uniform(0.1, 0.7), rng.uniform(0, 2 * np.pi)

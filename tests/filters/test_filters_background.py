@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tofuse.engine.cameras.cameras import unit_rays
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.background import Background
 from tofuse.engine.frames.frames import RangeFrame
@@ -39,16 +40,16 @@ def shown(scene: str, camera: str = "sr4000", count: int = 7, off: tuple[str, ..
     every = {"torso": 222, "box": 570}[scene] // count
     effects = Effects().without(*off)
     made = plan(scene, camera=camera, every=every, frames=count, effects=effects)
-    rays = made.model.camera.rays()
-    ahead = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1).reshape(-1, 3)
-    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    rays = unit_rays(made.model.camera.rays())
+    shape = rays.shape[:2]
+    ahead = rays.reshape(-1, 3)
     masks, stands = [], []
     names = np.array([m.name for m in made.scene.materials] + [""])
     for k in range(count):
         t = k * every / made.sequence.frame_rate_hz
         T = made.sequence.T_room_camera(t)
         hits = made.scene.cast(T[:3, 3], ahead @ T[:3, :3].T, made.sequence.T_room_object(t))
-        seen = names[hits.surface].reshape(rays.shape[:2])
+        seen = names[hits.surface].reshape(shape)
         masks.append(np.isin(seen, OF_OBJECT[scene]))
         stands.append(seen == "stand")
     return Shown(tuple(made.corrected_frames()), tuple(masks), tuple(stands))

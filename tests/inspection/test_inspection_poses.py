@@ -10,7 +10,7 @@ import pytest
 import tofuse
 from tofuse.apps.inspection.pose_convention import misread_poses
 from tofuse.apps.inspection.sample import Sample
-from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.cameras.cameras import Pinhole, unit_rays
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import quaternion, se3
@@ -61,14 +61,12 @@ def recording():
     """A room seen on a way with turns about all axes."""
     made = plan("room")
     camera = Pinhole(80, 60, 70.0, 70.0, 39.5, 29.5)
-    rays = np.insert(camera.rays().reshape(-1, 2).astype(float), 2, 1, -1)
+    rays = unit_rays(camera.rays().reshape(-1, 2))
     rng = np.random.default_rng(4)
     T = made.sequence.T_room_camera(made.raw[0] / made.sequence.frame_rate_hz)
     frames, poses = [], []
     for k in range(9):
-        hits = made.scene.cast(
-            T[:3, 3], (rays / np.linalg.norm(rays, axis=1)[:, None]) @ T[:3, :3].T
-        )
+        hits = made.scene.cast(T[:3, 3], rays @ T[:3, :3].T)
         z = hits.distance.reshape(60, 80) / np.sqrt((camera.rays() ** 2).sum(-1) + 1)
         z = np.where(np.isfinite(z), z + rng.normal(0, 0.003, z.shape), 0).astype(np.float32)
         frames.append(RangeFrame(k, k / 10, camera, z, "z"))

@@ -20,9 +20,11 @@ if TYPE_CHECKING:
         Pinhole,
         Rational,
         RayTable,
+        homogeneous,
         pinhole_values,
         ray_lengths,
         scaled,
+        unit_rays,
         unknown_rays,
     )
 

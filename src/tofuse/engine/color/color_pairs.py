@@ -12,10 +12,10 @@ from scipy.special import bdtrc
 
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Bool, Float64, Intp
+from tofuse.engine.cameras import homogeneous
 from tofuse.engine.color.color_views import (
     ColorView,
     Search,
-    homogeneous,
     matched,
 )
 from tofuse.engine.compute import run_all

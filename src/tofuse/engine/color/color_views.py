@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
-from tofuse.engine.cameras import Camera
+from tofuse.engine.cameras import Camera, homogeneous
 from tofuse.engine.color import patch_kernels as kernels
 from tofuse.engine.frames import RangeFrame
 
@@ -159,11 +159,6 @@ class ColorView:
     @property
     def _zoom(self) -> float:
         return self.image.shape[1] / self.camera.width
-
-
-def homogeneous(rays: Float64) -> Float64:
-    """(N, 3) points at z = 1."""
-    return np.concatenate([rays, np.ones((len(rays), 1))], 1)
 
 
 def matched(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Float64, UInt16
-from tofuse.engine.cameras import RayTable
+from tofuse.engine.cameras import RayTable, unit_rays
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_counts, evenly_spaced
 from tofuse.engine.parts import part
@@ -281,8 +281,7 @@ def _rays(samples: Sequence[tuple[Float64, Float64]]) -> Float32 | None:
     coefficients = fit.reshape(_DEGREE + 1, _DEGREE + 1, 2)
     rays = np.moveaxis(np.polynomial.legendre.leggrid2d(y, x, coefficients), 0, -1)
     rays[~has_ray] = np.nan
-    directions = np.concatenate([rays, np.ones((*shape, 1))], axis=-1)
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    directions = unit_rays(rays)
     error = [
         (points - directions * depth[..., None])[mask]
         for (depth, points), mask in zip(samples, masks, strict=True)
