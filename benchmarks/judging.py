@@ -101,8 +101,7 @@ def smoothed(poses: Float64, times: Float64, rng: np.random.Generator, size: flo
     out[:, :3, 3] = gaussian_filter1d(poses[:, :3, 3], size * SMOOTHED, axis=0, mode="nearest")
     R = poses[:, :3, :3].reshape(-1, 9)
     mean = gaussian_filter1d(R, size * SMOOTHED, axis=0, mode="nearest")
-    U, _, V = np.linalg.svd(mean.reshape(-1, 3, 3))
-    out[:, :3, :3] = U @ V
+    out[:, :3, :3] = se3.nearest_rotation(mean.reshape(-1, 3, 3))
     return out
 
 
