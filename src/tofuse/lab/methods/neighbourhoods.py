@@ -8,7 +8,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64, Int64
+from tofuse.engine.arrays import Bool, Float64, Int64
 from tofuse.engine.geometry import KdTree
 from tofuse.engine.icp import interfaces, surface_shape
 
@@ -120,7 +120,7 @@ def _fitted_mean_curvature(points: interfaces.Points) -> Float64:
     A = np.concatenate([A, np.ones_like(w)[..., None]], 2)
     At = np.swapaxes(A, 1, 2)
     M, g = At @ A, At @ w[..., None]
-    valid = np.isfinite(M).all((1, 2))
+    valid: Bool = np.asarray(np.isfinite(M).all((1, 2)))
     valid[valid] = np.linalg.eigvalsh(M[valid])[:, 0] > _MIN_EIGENVALUE * count
     x = np.full((len(M), 6), np.nan)
     x[valid] = np.linalg.solve(M[valid], g[valid])[..., 0]
