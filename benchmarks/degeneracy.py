@@ -29,9 +29,10 @@ from dataclasses import replace
 import numpy as np
 
 from covariance import KINDS
+from scoring import roc_area
 from tofuse.engine.alignment.projective import UNITS, Level, ProjectiveOptions, Target, align
 from tofuse.engine.alignment.uncertainty import covariance
-from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras.cameras import homogeneous, ray_lengths, unit_rays
 from tofuse.engine.geometry import se3
 from tofuse.engine.sensor.multipath_correction import Multipath
@@ -141,15 +142,6 @@ def returns(
         if abs(se3.log(se3.inverse(T) @ found) / UNITS @ direction) >= 1:
             return False
     return True
-
-
-def roc_area(score: Float64, positive: Bool) -> float:
-    """Area under the ROC curve: fraction of positive-negative pairs in the right order."""
-    ranks = np.argsort(np.argsort(score)) + 1.0
-    n, m = positive.sum(), (~positive).sum()
-    if not n or not m:
-        return float("nan")
-    return float((ranks[positive].sum() - n * (n + 1) / 2) / (n * m))
 
 
 def main() -> None:

@@ -18,14 +18,14 @@ ground truth by its trajectory. Printed for each:
 from __future__ import annotations
 
 import argparse
-import shutil
 import sys
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
 import sequences
+from made_once import made_once
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.cameras.cameras import unit_rays
 from tofuse.engine.compute.thread_pool import threads
@@ -109,12 +109,7 @@ class Walk:
     def recording(self) -> Recording:
         """The recording, simulated if it does not exist yet."""
         folder = OUT / str(self).replace("/", "_")
-        if not folder.is_dir():
-            unfinished = folder.with_suffix(".part")
-            shutil.rmtree(unfinished, ignore_errors=True)
-            write(self.plan, unfinished)
-            unfinished.rename(folder)
-        return open_recording(folder)
+        return open_recording(made_once(folder, partial(write, self.plan)))
 
     @cached_property
     def surface(self) -> Surface:

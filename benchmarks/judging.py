@@ -28,8 +28,8 @@ from scipy.ndimage import gaussian_filter1d
 
 import sequences
 import verdict
-from pairs import roc_area
 from robustness import OURS, agreement, ours, peer, peer_methods
+from scoring import roc_area
 from tofuse.apps.jobs.judging import judge
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import TofuseError

@@ -38,7 +38,7 @@ from tofuse.engine.arrays import Float32, Float64
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import tofuse
-from cloud_kinds import Pair, any_motion, scanner_rays
+from cloud_kinds import OBJECT_M, Pair, any_motion, scanner_rays
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
@@ -60,8 +60,6 @@ ROOMS = (
     ("corner", "pico-flexx", (5, 30)),
 )
 OBJECTS = (("torso", "sr4000", (3, 12)), ("box", "sr4000", (5, 20)))
-# A rotating object stands in front of a static background.
-_OBJECT_M = 1.6
 FAMILIES = (
     "range images",
     "camera clouds",
@@ -123,7 +121,7 @@ def _of_objects(seed: int) -> Iterator[Case]:
     for kind, camera, gap in OBJECTS:
         rng = np.random.default_rng([seed, 12, len(kind)])
         views, true = _views(kind, camera, gap, seed, rng)
-        near = [v.points[np.linalg.norm(v.points, axis=1) < _OBJECT_M] for v in views]
+        near = [v.points[np.linalg.norm(v.points, axis=1) < OBJECT_M] for v in views]
         if min(map(len, near)) < 300:
             continue
         target, source = (_thinned(points, rng) for points in near)

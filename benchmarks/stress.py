@@ -10,14 +10,15 @@ the other.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
+from made_once import made_once
 from scoring import Truth
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.cameras.cameras import BrownConrady, homogeneous
@@ -157,12 +158,7 @@ def take(
     elif motion == "close-up":
         path = close_up(made.sequence.camera_path, start + 2.0, paths.look_at(*scene.bare))
         made = replace(made, sequence=replace(made.sequence, camera_path=path))
-    if not folder.is_dir():
-        unfinished = folder.with_name(f"{folder.name}.part")
-        shutil.rmtree(unfinished, ignore_errors=True)
-        write(made, unfinished)
-        unfinished.rename(folder)
-    recording = open_recording(folder)
+    recording = open_recording(made_once(folder, partial(write, made)))
     images = tuple(frame for frame in recording if isinstance(frame, RangeFrame))
     if not falloff:
         images = tuple(evenly_lit(frame, made.model.transmission) for frame in images)
