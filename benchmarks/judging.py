@@ -31,6 +31,7 @@ import verdict
 from robustness import OURS, agreement, ours, peer, peer_methods
 from scoring import roc_area
 from tofuse.apps.jobs.judging import judge
+from tofuse.apps.jobs.pose_scale import with_scale
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import TofuseError
 from tofuse.engine.frames.recording import Recording
@@ -82,9 +83,7 @@ def jumping(poses: Float64, times: Float64, rng: np.random.Generator, size: floa
 
 def scaled(poses: Float64, times: Float64, rng: np.random.Generator, size: float) -> Float64:
     """Poses with a scale error."""
-    out = poses.copy()
-    out[:, :3, 3] *= 1 + size * SCALE
-    return out
+    return with_scale(poses, 1 + size * SCALE)
 
 
 def late(poses: Float64, times: Float64, rng: np.random.Generator, size: float) -> Float64:

@@ -10,6 +10,7 @@ import pytest
 import tofuse
 from tofuse.apps.inspection.pose_convention import misread_poses
 from tofuse.apps.inspection.sample import Sample
+from tofuse.apps.jobs.pose_scale import with_scale
 from tofuse.engine.cameras.cameras import Pinhole, unit_rays
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
@@ -27,12 +28,6 @@ def rolled(T, shift):
     return out
 
 
-def scaled(T, factor):
-    out = T.copy()
-    out[:, :3, 3] *= factor
-    return out
-
-
 def turned(T, quarters):
     return T @ se3.exp(np.array([0, 0, 0, 0, 0, quarters * np.pi / 2]))
 
@@ -47,11 +42,11 @@ MISREAD = {
     "turned by 90 degrees": lambda T: turned(T, -1),
     "turned by 180 degrees": lambda T: turned(T, -2),
     "turned by 270 degrees": lambda T: turned(T, -3),
-    "in mm": lambda T: scaled(T, 1000),
-    "in cm": lambda T: scaled(T, 100),
-    "in feet": lambda T: scaled(T, 3.281),
-    "2.5 times as far apart": lambda T: scaled(T, 2.5),
-    "0.4 times as far apart": lambda T: scaled(T, 0.4),
+    "in mm": lambda T: with_scale(T, 1000),
+    "in cm": lambda T: with_scale(T, 100),
+    "in feet": lambda T: with_scale(T, 3.281),
+    "2.5 times as far apart": lambda T: with_scale(T, 2.5),
+    "0.4 times as far apart": lambda T: with_scale(T, 0.4),
 }
 SCALES = ("in feet", "2.5 times as far apart", "0.4 times as far apart")
 
