@@ -31,11 +31,12 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from tofuse.apps.jobs import Options, run
-from tofuse.engine.cameras import Pinhole, homogeneous
+from tofuse.engine.cameras import Pinhole
 from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.fusion import Mesh, Textured, drawing
 from tofuse.engine.fusion.display_surface import TOLERANCE_FRACTION, TOLERANCE_M
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.mapping import texturing
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.recordings import open_recording

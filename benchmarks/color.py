@@ -26,9 +26,10 @@ import numpy as np
 
 from phone import features_of, matched_rays, opened, parsed, present
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras import homogeneous, scaled
+from tofuse.engine.cameras import scaled
 from tofuse.engine.frames.recording import POSES_BY, Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.mapping.adaptation import Prior, with_prior
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct

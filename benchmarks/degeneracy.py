@@ -33,8 +33,9 @@ from scoring import roc_area
 from tofuse.engine.alignment.projective import UNITS, Level, ProjectiveOptions, Target, align
 from tofuse.engine.alignment.uncertainty import covariance
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import homogeneous, ray_lengths, unit_rays
+from tofuse.engine.cameras.cameras import ray_lengths
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous, unit_rays
 from tofuse.engine.sensor.multipath_correction import Multipath
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions

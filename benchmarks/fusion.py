@@ -37,7 +37,6 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.cameras.cameras import unit_rays
 from tofuse.engine.compute.spill import Spill
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.filters.base import apply_filters
@@ -49,6 +48,7 @@ from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.fusion.range_view import RangeView, StoredViews
 from tofuse.engine.fusion.tsdf import Volume, fitting_voxel, fuse_surface
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import unit_rays
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.mapper import Mapper
 from tofuse.engine.mapping.methods import from_method

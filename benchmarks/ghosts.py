@@ -27,7 +27,6 @@ import numpy as np
 import sequences
 from made_once import made_once
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.cameras.cameras import unit_rays
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import Recording
@@ -35,6 +34,7 @@ from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.range_view import RangeView
 from tofuse.engine.fusion.tsdf import fuse_surface
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import unit_rays
 from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.preparation import Preparation

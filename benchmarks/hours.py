@@ -36,10 +36,11 @@ from scipy.interpolate import PchipInterpolator
 
 from tofuse.apps.results.run_json import frames_in_main_model
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras.cameras import Pinhole, homogeneous
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 from tofuse.formats.export.conversion import convert
 from tofuse.formats.poses.trajectory import read_tum

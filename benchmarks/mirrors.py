@@ -19,9 +19,9 @@ import tofuse
 import unusual
 from tofuse.apps.mirrors import find_mirrors
 from tofuse.apps.mirrors.openings import Plane
-from tofuse.engine.cameras.cameras import homogeneous, unit_rays
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous, unit_rays
 from tofuse.engine.results import Reconstruction
 from tofuse.lab.simulation.mirrors import Mirror, hang_mirror
 from tofuse.lab.world import scene as scenes

@@ -34,10 +34,11 @@ import numpy as np
 
 from tofuse.apps.jobs.run_options import Options, resolve
 from tofuse.engine.arrays import Bool, Float32, Float64
-from tofuse.engine.cameras.cameras import homogeneous, ray_lengths
+from tofuse.engine.cameras.cameras import ray_lengths
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.reconstructing import reconstruct

@@ -17,10 +17,11 @@ import numpy as np
 
 import unusual
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras.cameras import Pinhole, homogeneous
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.lab.scenes.composition import Assembly, placed, shell
 from tofuse.lab.scenes.furniture import chair, desk
 from tofuse.lab.world import mesh as meshes

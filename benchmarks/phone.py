@@ -36,12 +36,13 @@ from scipy.optimize import least_squares
 import sequences
 from fusion import views_of
 from tofuse.engine.arrays import Float32, Float64, Intp
-from tofuse.engine.cameras import homogeneous, scaled
+from tofuse.engine.cameras import scaled
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import Recording, evenly_spaced
 from tofuse.engine.fusion import display_surface
 from tofuse.engine.fusion.tsdf import fuse_surface
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.mapping.adaptation import Prior, adapted, with_prior
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct

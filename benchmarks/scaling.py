@@ -44,12 +44,13 @@ import hours
 import tofuse
 from stages import grouped
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.cameras.cameras import Pinhole, homogeneous
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.thread_pool import run_chunks
 from tofuse.engine.compute.thread_pool import threads as using_threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.stopwatch import Stopwatch
 from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.formats.recordings.open import open_recording

@@ -21,10 +21,11 @@ from scipy.sparse.csgraph import connected_components
 from made_once import made_once
 from scoring import Truth
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.cameras.cameras import BrownConrady, homogeneous
+from tofuse.engine.cameras.cameras import BrownConrady
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float64, Intp
-from tofuse.engine.cameras.cameras import Camera, Pinhole, homogeneous
+from tofuse.engine.cameras.cameras import Camera, Pinhole
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry.rays import homogeneous
 
 MAX_DEPTH_M = 12.0
 

@@ -12,9 +12,10 @@ from tofuse.apps.calibration.board import Board
 from tofuse.apps.calibration.depth import DepthFit, calibrate_depth
 from tofuse.apps.calibration.plane_views import PlaneView, board_planes, scene_planes
 from tofuse.apps.cli.program import main
-from tofuse.engine.cameras.cameras import Pinhole, unit_rays
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.recording import Recording
+from tofuse.engine.geometry.rays import unit_rays
 from tofuse.formats.cameras.calibration_files import read_correction
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording

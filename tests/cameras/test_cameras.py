@@ -15,13 +15,12 @@ from tofuse.engine.cameras.cameras import (
     Pinhole,
     Rational,
     RayTable,
-    homogeneous,
     ray_lengths,
     scaled,
-    unit_rays,
 )
 from tofuse.engine.cameras.depth_conversion import points_from_z, range_from_z, z_from_range
 from tofuse.engine.errors import InputError
+from tofuse.engine.geometry.rays import homogeneous, unit_rays
 
 PINHOLE = Pinhole(176, 144, 230.0, 231.0, 87.0, 71.5)
 BROWN = BrownConrady(176, 144, 230.0, 231.0, 87.0, 71.5, -0.3, 0.1, 0.001, -0.002, 0.01)

@@ -19,16 +19,9 @@ from posed_results import BROWN, DISTANCE, NORMAL, POSED, POSES, SIZE, made_resu
 from tofuse.apps.cli.program import main
 from tofuse.apps.export.exporting import export
 from tofuse.apps.results.run_json import read_run_json
-from tofuse.engine.cameras.cameras import (
-    BrownConrady,
-    Camera,
-    Fisheye,
-    Pinhole,
-    Rational,
-    RayTable,
-    homogeneous,
-)
+from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
 from tofuse.engine.errors import OutputError
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.formats.geometry.ply import read_ply
 from tofuse.formats.poses.trajectory import read_tum, write_tum
 from tofuse.formats.poses.trajectory_formats import read_poses

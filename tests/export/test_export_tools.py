@@ -17,10 +17,11 @@ from tofuse.apps.cli.program import main
 from tofuse.apps.export.exporting import export
 from tofuse.apps.export.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from tofuse.apps.results.folders import OutputFolder
-from tofuse.engine.cameras.cameras import Pinhole, homogeneous
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import quaternion, se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.formats.export.octomap import write_octomap
 from tofuse.formats.geometry.ply import read_ply, write_ply
 from written_run_json import change_run

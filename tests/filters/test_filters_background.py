@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
-from tofuse.engine.cameras.cameras import unit_rays
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.background import Background
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry.rays import unit_rays
 from tofuse.engine.sensor.scattering import LensScattering
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from test_fusion_texture import CAMERA, sheet
 
-from tofuse.engine.cameras.cameras import homogeneous
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion.color_alignment import Shown, aligned_poses
 from tofuse.engine.fusion.texture import TextureView, _Seen, textured
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 
 WALL = sheet(61, 45, 0.03)
 POSES = se3.exp(

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ray_casting import to_plane
-from tofuse.engine.cameras.cameras import BrownConrady, unit_rays
+from tofuse.engine.cameras.cameras import BrownConrady
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry.rays import unit_rays
 
 EYE = np.eye(4)
 

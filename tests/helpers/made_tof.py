@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from made_phones import DEPTH, HEIGHT, WIDTH
-from tofuse.engine.cameras.cameras import Rational, homogeneous
+from tofuse.engine.cameras.cameras import Rational
+from tofuse.engine.geometry.rays import homogeneous
 
 
 def make_arducam(folder: Path) -> None:

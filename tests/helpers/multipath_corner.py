@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from tofuse.engine.cameras.cameras import Pinhole, homogeneous, ray_lengths
+from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.sensor.multipath import ToFImage
 
 CAMERA = Pinhole(60, 48, 54.0, 54.0, 29.5, 23.5)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.engine.cameras import homogeneous
+from tofuse.engine.geometry.rays import homogeneous
 
 
 def rays_at(T_world_camera, camera):

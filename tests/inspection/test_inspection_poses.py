@@ -11,10 +11,11 @@ import tofuse
 from tofuse.apps.inspection.pose_convention import misread_poses
 from tofuse.apps.inspection.sample import Sample
 from tofuse.apps.jobs.pose_scale import with_scale
-from tofuse.engine.cameras.cameras import Pinhole, unit_rays
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import quaternion, se3
+from tofuse.engine.geometry.rays import unit_rays
 from tofuse.lab.simulation.record import plan
 
 GL = np.diag([1.0, -1, -1, 1])

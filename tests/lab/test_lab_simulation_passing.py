@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.engine.cameras.cameras import unit_rays
+from tofuse.engine.geometry.rays import unit_rays
 from tofuse.formats.images.images import read_image
 from tofuse.lab.simulation.effects import Effects, Flag
 from tofuse.lab.simulation.passing import Passing

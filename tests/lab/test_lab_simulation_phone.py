@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras import homogeneous, scaled
+from tofuse.engine.cameras import scaled
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.formats.poses import read_tum
 from tofuse.formats.recordings import open_recording

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tofuse.engine.cameras.cameras import homogeneous
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.formats.geometry.ply import read_ply
 from tofuse.formats.images.images import read_image
 from tofuse.formats.poses.trajectory import read_tum

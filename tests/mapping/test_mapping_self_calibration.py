@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from boxes_in_room import views_in_room
-from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable, homogeneous
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.mapping.config import changed
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from paths import DOCS
-from tofuse.engine.cameras.cameras import Pinhole, homogeneous, ray_lengths
+from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.noise.model import (
     NOISE,
     AmplitudeLaw,

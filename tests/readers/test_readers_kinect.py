@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import made_kinect as made
-from tofuse.engine.cameras.cameras import RayTable, homogeneous
+from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.errors import InputError
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.formats.cameras.camera_file import ColorCamera
 from tofuse.formats.recordings.open import open_recording
 

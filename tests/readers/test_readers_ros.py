@@ -27,9 +27,10 @@ from ros_bags import (
     orbbec,
     real_sense,
 )
-from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, Rational, homogeneous
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, Rational
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.geometry.se3 import exp, inverse, log
 from tofuse.formats.images.images import png_bytes
 from tofuse.formats.readers.maker_bags import RealSenseSource

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from tofuse.engine.alignment import step_kernels as steps
-from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, homogeneous
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
 from tofuse.engine.geometry import rigid_motion_kernels as rigid_motions
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.views import residual_kernels as kernels
 from tofuse.engine.views.projection import Projection
 

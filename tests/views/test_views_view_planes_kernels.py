@@ -7,7 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
-from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, homogeneous
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.views.view_planes_kernels import (
     albedo_image,
     fit_planes,

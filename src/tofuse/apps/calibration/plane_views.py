@@ -9,10 +9,10 @@ import numpy as np
 
 from tofuse.apps.calibration.board import Board, board_pose, search_board
 from tofuse.engine.arrays import Bool, Float64, Intp
-from tofuse.engine.cameras import Camera, depth_conversion, homogeneous, ray_lengths
+from tofuse.engine.cameras import Camera, depth_conversion, ray_lengths
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, Recording
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import homogeneous, se3
 from tofuse.engine.noise import NoiseModel, noise_model_for
 from tofuse.engine.search import detect_planes
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view

@@ -10,7 +10,7 @@ import numpy as np
 
 from tofuse.apps.mirrors.views import Noise, View
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.cameras import unit_rays
+from tofuse.engine.geometry import unit_rays
 
 # Planes: number of hypotheses and of points that vote, fewest of them on a plane, and the
 # smallest cosine between its normal and those of its points.

@@ -20,11 +20,9 @@ if TYPE_CHECKING:
         Pinhole,
         Rational,
         RayTable,
-        homogeneous,
         pinhole_values,
         ray_lengths,
         scaled,
-        unit_rays,
         unknown_rays,
     )
 

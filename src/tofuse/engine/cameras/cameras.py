@@ -53,18 +53,6 @@ def unknown_rays(camera: Camera) -> Bool | None:
     return _derived(camera)[1]
 
 
-def homogeneous(rays: ArrayLike) -> Float64:
-    """Return the points (..., 3) at z = 1 of rays (..., 2), as of `Camera.rays`."""
-    rays = np.asarray(rays, float)
-    return np.concatenate([rays, np.ones((*rays.shape[:-1], 1))], -1)
-
-
-def unit_rays(rays: ArrayLike) -> Float64:
-    """Return the unit vectors (..., 3) of rays (..., 2), as of `Camera.rays`."""
-    points = homogeneous(rays)
-    return np.asarray(points / np.linalg.norm(points, axis=-1, keepdims=True), np.float64)
-
-
 # Cache by camera, as these are needed for every frame.
 _cache: WeakKeyDictionary[Camera, tuple[Float32, Bool | None]] = WeakKeyDictionary()
 

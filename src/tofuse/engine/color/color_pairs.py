@@ -12,7 +12,6 @@ from scipy.special import bdtrc
 
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Bool, Float64, Intp
-from tofuse.engine.cameras import homogeneous
 from tofuse.engine.color.color_views import (
     ColorView,
     Search,
@@ -20,7 +19,7 @@ from tofuse.engine.color.color_views import (
 )
 from tofuse.engine.compute import run_all
 from tofuse.engine.frames import evenly_spaced
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import homogeneous, se3
 from tofuse.engine.graph import Measured
 
 # Earlier partners of a view, evenly spread over those that show this fraction of its patches.

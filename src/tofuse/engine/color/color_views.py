@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
-from tofuse.engine.cameras import Camera, homogeneous
+from tofuse.engine.cameras import Camera
 from tofuse.engine.color import patch_kernels as kernels
 from tofuse.engine.frames import RangeFrame
+from tofuse.engine.geometry import homogeneous
 
 # Patches of a view, and the pixels of its image: of a larger one every n-th.
 POINTS, _PIXELS = 300, 1_000_000

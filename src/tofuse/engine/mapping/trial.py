@@ -31,10 +31,9 @@ from scipy.special import stdtrit
 
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float32, Float64, Intp
-from tofuse.engine.cameras import homogeneous
 from tofuse.engine.compute import run_all
 from tofuse.engine.frames import Frame, RangeFrame, Recording
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import homogeneous, se3
 from tofuse.engine.normal import robust_sigma
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 

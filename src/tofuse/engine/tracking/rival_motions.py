@@ -22,8 +22,7 @@ import cv2
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
-from tofuse.engine.cameras import homogeneous
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import homogeneous, se3
 from tofuse.engine.search import pair_agreement
 from tofuse.engine.tracking import moving_object_kernels as kernels
 from tofuse.engine.tracking.moving_objects import compared, stride_of

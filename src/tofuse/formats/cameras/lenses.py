@@ -6,15 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from tofuse.engine.cameras import (
-    DISTORTION_ORDER,
-    MODELS,
-    BrownConrady,
-    Pinhole,
-    RayTable,
-    homogeneous,
-)
+from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, BrownConrady, Pinhole, RayTable
 from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import homogeneous
 from tofuse.formats.cameras.camera_file import checked_lens
 
 

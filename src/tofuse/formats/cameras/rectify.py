@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
-from tofuse.engine.cameras import Camera, Pinhole, homogeneous
+from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.frames import RangeFrame
+from tofuse.engine.geometry import homogeneous
 
 # Beyond this slope of a ray (60 degrees off the axis) a pinhole image is mostly stretched rim.
 MAX_SLOPE = 1.75

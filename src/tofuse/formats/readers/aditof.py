@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32, Float64, UInt16
-from tofuse.engine.cameras import RayTable, unit_rays
+from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_counts, evenly_spaced
+from tofuse.engine.geometry import unit_rays
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs

@@ -10,8 +10,9 @@ from scipy import ndimage
 from scipy.constants import speed_of_light
 
 from tofuse.engine.arrays import Bool, Float64, Int32
-from tofuse.engine.cameras import Pinhole, unit_rays
+from tofuse.engine.cameras import Pinhole
 from tofuse.engine.compute import run_chunks
+from tofuse.engine.geometry import unit_rays
 from tofuse.lab.simulation import phasor_kernels as phasor
 from tofuse.lab.simulation.models import CameraModel
 from tofuse.lab.world import Scene

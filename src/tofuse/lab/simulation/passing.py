@@ -14,9 +14,8 @@ from typing import Literal
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras import unit_rays
 from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, unit_rays
 from tofuse.lab.scenes import HAIR, SHIRT, SKIN, TROUSERS
 from tofuse.lab.simulation.models import CameraModel
 from tofuse.lab.world import Body, Material, Mesh, Scene, Sequence, paths

@@ -20,9 +20,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from tofuse.engine.arrays import Float64, UInt8, UInt16
-from tofuse.engine.cameras import Pinhole, homogeneous, scaled
+from tofuse.engine.cameras import Pinhole, scaled
 from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import homogeneous, se3
 from tofuse.formats.files import atomic, staging
 from tofuse.formats.images import jpeg_bytes, write_png
 from tofuse.formats.poses import write_tum
