@@ -36,6 +36,7 @@ from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.fusion import Mesh, Textured, drawing
 from tofuse.engine.fusion.display_surface import TOLERANCE_FRACTION, TOLERANCE_M
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.mapping import texturing
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.recordings import open_recording
@@ -240,7 +241,7 @@ def _aligned(
         rows, columns = rows[some], columns[some]
         pixels = (np.c_[columns, rows] + 0.5) / scale - 0.5
         at = _rays_at(camera, pixels)
-        points = np.c_[at, np.ones(len(at))] * z[rows, columns][:, None]
+        points = homogeneous(at) * z[rows, columns][:, None]
         target = pixels + moved[rows, columns] / scale
 
         def residuals(xi: np.ndarray, p: Any = points, target: Any = target) -> np.ndarray:
@@ -282,7 +283,7 @@ def rendered(
     T = se3.inverse(T_world_camera)
     p = mesh.vertices.astype(float) @ T[:3, :3].T + T[:3, 3]
     z = np.maximum(p[:, 2], 1e-6)
-    pixels = (camera.project(np.c_[p[:, :2] / z[:, None], np.ones(len(p))]) + 0.5) * [
+    pixels = (camera.project(homogeneous(p[:, :2] / z[:, None])) + 0.5) * [
         size[0] / camera.width,
         size[1] / camera.height,
     ] - 0.5

@@ -28,10 +28,13 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from time import perf_counter, sleep
 
 import numpy as np
+
+from made_once import made_once
 
 OUT = Path(__file__).parent / "out" / "batch"
 MODES = ("machine", "LocalCluster", "processes")
@@ -62,15 +65,14 @@ def make_recordings(folder: Path, count: int, frames: int) -> list[Path]:
     """Simulate the recordings that do not exist yet."""
     from tofuse.lab.simulation.record import simulate
 
-    paths = [folder / f"{frames}-frames" / f"room-{k:03d}" for k in range(count)]
-    for k, path in enumerate(paths):
-        if not (path / "camera.json").exists():
-            shutil.rmtree(path, ignore_errors=True)
-            part = path.with_suffix(".part")
-            shutil.rmtree(part, ignore_errors=True)
-            simulate("room", part, frames=frames, first=k % 50, seed=k)
-            os.replace(part, path)
-    return paths
+    made = folder / f"{frames}-frames"
+    return [
+        made_once(
+            made / f"room-{k:03d}",
+            partial(simulate, "room", frames=frames, first=k % 50, seed=k),
+        )
+        for k in range(count)
+    ]
 
 
 def run_alone(recordings: list[Path], out: Path) -> float:

@@ -24,6 +24,7 @@ import pairs
 import tofuse.engine
 from attacks.journal import Lines
 from cloud_kinds import KINDS, Pair
+from scoring import roc_area
 from sequences import OUT
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.arrays import Bool, Float64
@@ -260,5 +261,5 @@ def print_outcomes(rows: dict[str, Outcomes]) -> None:
         which = np.clip(np.searchsorted(_BINS, p, side="right") - 1, 0, len(bins) - 1)
         counts = [f"{right[which == k].sum()} of {(which == k).sum()}" for k in range(len(bins))]
         cells = [len(p), right.sum(), (accepted & right).sum(), (accepted & ~right).sum()]
-        area = f"{pairs.roc_area(p, right):.3f}" if right.any() and not right.all() else ""
+        area = f"{roc_area(p, right):.3f}" if right.any() and not right.all() else ""
         print(f"| {family} | {' | '.join(map(str, cells))} | {area} | {' | '.join(counts)} |")

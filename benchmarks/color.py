@@ -29,6 +29,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import scaled
 from tofuse.engine.frames.recording import POSES_BY, Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.mapping.adaptation import Prior, with_prior
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
@@ -151,7 +152,7 @@ def epipolar_matches(recording: Recording) -> list[tuple[int, int, Float64, Floa
 def epipolar_distance(T_b_a: Float64, x_a: Float64, x_b: Float64, focal: float) -> float:
     """Median Sampson distance of matches, pixels."""
     E = se3.hat(T_b_a[:3, 3] / max(float(np.linalg.norm(T_b_a[:3, 3])), 1e-9)) @ T_b_a[:3, :3]
-    h_a, h_b = (np.concatenate([x, np.ones((len(x), 1))], 1) for x in (x_a, x_b))
+    h_a, h_b = homogeneous(x_a), homogeneous(x_b)
     in_b, in_a = h_a @ E.T, h_b @ E
     scale = np.sqrt((in_b[:, :2] ** 2).sum(1) + (in_a[:, :2] ** 2).sum(1))
     return focal * float(np.median(np.abs((h_b * in_b).sum(1)) / scale))

@@ -32,11 +32,9 @@ from tofuse.engine.search.verification import FitStatistics
 from tofuse.engine.sensor.multipath_correction import Multipath
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
-from tofuse.formats.cameras.calibration_files import corrected_depth
-from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
-from tofuse.lab.simulation.render import render
+from tofuse.lab.simulation.record import RecordingPlan
 from tofuse.lab.world.scene import build
 
 KINDS = ("room", "empty-room", "wall", "corner", "corridor")
@@ -65,14 +63,10 @@ def chain(kind: str, seed: int, effects: Effects, camera: str) -> Chain:
         twist = np.concatenate([rng.normal(0, 0.15, 3), rng.normal(0, np.radians(8), 3)])
     path, start = sequence.camera_path, first / sequence.frame_rate_hz
     sequence = replace(sequence, camera_path=lambda t: path(t) @ se3.exp(twist * (t - start)))
-    factory = sensor.factory_correction(model, effects)
-    frames, poses = [], []
-    for index in (first, first + step, first + 2 * step):
-        raw = render(scene, sequence, model, index, effects=effects, seed=seed).frame
-        depth = corrected_depth(factory, raw.camera, raw.depth, raw.depth_kind)
-        frames.append(replace(raw, depth=depth))
-        poses.append(sequence.T_room_camera(index / sequence.frame_rate_hz))
-    return Chain(frames, poses)
+    raw = first + step * np.arange(3)
+    made = RecordingPlan(scene, sequence, model, effects, seed, raw)
+    poses = [sequence.T_room_camera(index / sequence.frame_rate_hz) for index in raw]
+    return Chain([*made.corrected_frames()], poses)
 
 
 def chains(arguments: argparse.Namespace, noise: str) -> Iterator[tuple[str, int, Chain]]:

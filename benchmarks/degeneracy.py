@@ -29,19 +29,19 @@ from dataclasses import replace
 import numpy as np
 
 from covariance import KINDS
+from scoring import roc_area
 from tofuse.engine.alignment.projective import UNITS, Level, ProjectiveOptions, Target, align
 from tofuse.engine.alignment.uncertainty import covariance
-from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras.cameras import ray_lengths
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous, unit_rays
 from tofuse.engine.sensor.multipath_correction import Multipath
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
-from tofuse.formats.cameras.calibration_files import corrected_depth
-from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model, noise_of
-from tofuse.lab.simulation.render import render
+from tofuse.lab.simulation.record import RecordingPlan
 from tofuse.lab.world.scene import Scene, build
 
 SUBPIXELS = 3
@@ -62,8 +62,7 @@ def true_information(
     R, origin = T_room_source[:3, :3], T_room_source[:3, 3]
 
     def cast(x: Float64, y: Float64) -> tuple[Float64, Float64, Float64]:
-        ray = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
-        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        ray = unit_rays(np.stack([x, y], -1).reshape(-1, 2))
         hits = scene.cast(origin, ray @ R.T)
         shape = x.shape
         normal = hits.normal.astype(float) @ R
@@ -77,9 +76,7 @@ def true_information(
 
     seen = np.isfinite(distance) & (distance < model.ambiguity_m)
     distance = np.where(seen, distance, 1.0)
-    points = (
-        np.concatenate([rays, np.ones((height, width, 1))], -1) * (distance / lengths)[..., None]
-    )
+    points = homogeneous(rays) * (distance / lengths)[..., None]
     cosine = np.abs((normal * points).sum(-1)) / distance
     moved = se3.transform(T_target_source, points.reshape(-1, 3)).reshape(points.shape)
     pixel = camera.project(moved)
@@ -148,15 +145,6 @@ def returns(
     return True
 
 
-def roc_area(score: Float64, positive: Bool) -> float:
-    """Area under the ROC curve: fraction of positive-negative pairs in the right order."""
-    ranks = np.argsort(np.argsort(score)) + 1.0
-    n, m = positive.sum(), (~positive).sum()
-    if not n or not m:
-        return float("nan")
-    return float((ranks[positive].sum() - n * (n + 1) / 2) / (n * m))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=12)
@@ -166,7 +154,6 @@ def main() -> None:
     arguments = parser.parse_args()
     model = camera_model(arguments.camera)
     effects = Effects(noise=arguments.noise)
-    factory = sensor.factory_correction(model, effects)
     rows: dict[str, list[tuple[str, float, dict[str, float], float, bool]]] = defaultdict(list)
     for seed in range(arguments.first, arguments.first + arguments.seeds):
         for kind in KINDS:
@@ -175,14 +162,14 @@ def main() -> None:
             scene, sequence = build(kind, seed=seed, texture=texture)
             step = int(rng.integers(1, 5))
             first = int(rng.integers(0, sequence.frames - step))
+            raw = np.array([first, first + step])
+            made = RecordingPlan(scene, sequence, model, effects, seed, raw)
             compensation = Multipath().start()
-            poses, views = [], []
-            for index in (first, first + step):
-                raw = render(scene, sequence, model, index, effects=effects, seed=seed).frame
-                depth = corrected_depth(factory, raw.camera, raw.depth, raw.depth_kind)
-                frame = compensation.apply(replace(raw, depth=depth))
-                views.append(prepare_view(frame, SurfaceOptions()))
-                poses.append(sequence.T_room_camera(index / sequence.frame_rate_hz))
+            views = [
+                prepare_view(compensation.apply(frame), SurfaceOptions())
+                for frame in made.corrected_frames()
+            ]
+            poses = [sequence.T_room_camera(index / sequence.frame_rate_hz) for index in raw]
             T = se3.inverse(poses[0]) @ poses[1]
             truths = true_information(scene, model, poses[1], T)
             name = f"{kind} {'textured' if texture else 'uniform'}"

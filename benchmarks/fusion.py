@@ -48,13 +48,13 @@ from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.fusion.range_view import RangeView, StoredViews
 from tofuse.engine.fusion.tsdf import Volume, fitting_voxel, fuse_surface
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import unit_rays
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.mapper import Mapper
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.sensor.multipath_correction import Multipath
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
-from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.lab.experiments.surface_error import Surface, compare_surfaces, distances
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import RecordingPlan, plan
@@ -69,12 +69,7 @@ def simulated(every: int, everything: bool) -> tuple[RecordingPlan, list[RangeFr
     """The plan and its frames, after factory correction."""
     made = plan("room", effects=Effects() if everything else _NOISE)
     made = replace(made, raw=made.raw[::every])
-    frames = []
-    for rendered in made.frames(None):
-        frame = rendered.frame
-        depth = corrected_depth(made.correction, frame.camera, frame.depth, frame.depth_kind)
-        frames.append(replace(frame, depth=depth))
-    return made, frames
+    return made, [*made.corrected_frames()]
 
 
 def seen_by(made: RecordingPlan, masks: list[Bool], frames: list[RangeFrame]) -> Float64:
@@ -83,8 +78,7 @@ def seen_by(made: RecordingPlan, masks: list[Bool], frames: list[RangeFrame]) ->
     rate = made.sequence.frame_rate_hz
     for raw, T_world, mask, frame in zip(made.raw, made.poses, masks, frames, strict=True):
         T = made.sequence.T_room_camera(raw / rate)
-        d = np.insert(frame.camera.rays()[mask].astype(float), 2, 1, -1)
-        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        d = unit_rays(frame.camera.rays()[mask])
         hits = made.scene.cast(T[:3, 3], d @ T[:3, :3].T)
         points = se3.transform(T_world, d * hits.distance[:, None].astype(float))
         seen.append(points[np.isfinite(points).all(1)])
@@ -146,8 +140,7 @@ def around_the_room(
     made = plan(scene)
     camera = made.model.camera
     shape = camera.rays().shape[:2]
-    rays = np.insert(camera.rays().reshape(-1, 2).astype(float), 2, 1, -1)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = unit_rays(camera.rays().reshape(-1, 2))
     for k in range(count):
         rng = np.random.default_rng([seed, k])
         time_s = made.raw[step * k % len(made.raw)] / made.sequence.frame_rate_hz

@@ -18,14 +18,14 @@ ground truth by its trajectory. Printed for each:
 from __future__ import annotations
 
 import argparse
-import shutil
 import sys
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
 import sequences
+from made_once import made_once
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import RangeFrame
@@ -34,6 +34,7 @@ from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.range_view import RangeView
 from tofuse.engine.fusion.tsdf import fuse_surface
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import unit_rays
 from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.preparation import Preparation
@@ -108,12 +109,7 @@ class Walk:
     def recording(self) -> Recording:
         """The recording, simulated if it does not exist yet."""
         folder = OUT / str(self).replace("/", "_")
-        if not folder.is_dir():
-            unfinished = folder.with_suffix(".part")
-            shutil.rmtree(unfinished, ignore_errors=True)
-            write(self.plan, unfinished)
-            unfinished.rename(folder)
-        return open_recording(folder)
+        return open_recording(made_once(folder, partial(write, self.plan)))
 
     @cached_property
     def surface(self) -> Surface:
@@ -141,8 +137,7 @@ def measured(walk: Walk, recording: Recording) -> Places:
     for raw, T_world, frame in zip(walk.plan.raw, walk.plan.poses, recording, strict=True):
         assert isinstance(frame, RangeFrame)
         T = sequence.T_room_camera(raw / sequence.frame_rate_hz)
-        rays = np.insert(frame.camera.rays()[frame.valid].astype(float), 2, 1, -1)
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        rays = unit_rays(frame.camera.rays()[frame.valid])
         hits = scene.cast(T[:3, 3], rays @ T[:3, :3].T)
         hit = np.isfinite(hits.distance)
         at = se3.transform(T_world, rays[hit] * hits.distance[hit, None].astype(float))

@@ -40,6 +40,7 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 from tofuse.formats.export.conversion import convert
 from tofuse.formats.poses.trajectory import read_tum
@@ -125,11 +126,11 @@ def _room(assembly: Assembly, room: int, rng: np.random.Generator) -> None:
     lining = [quad((s * DOOR, -a - WALL, 0), (0, WALL, 0), (0, 0, DOOR_TOP)) for s in (-1, 1)]
     lining.append(quad((-DOOR, -a - WALL, DOOR_TOP), (2 * DOOR, 0, 0), (0, WALL, 0)))
     for wall, parts in zip(walls, sides, strict=True):
-        assembly.add(wall, *(part.transformed(T) for part in parts))
-    assembly.add(walls[3], *(part.transformed(T) for part in lining))
+        assembly.at(T).add(wall, *parts)
+    assembly.at(T).add(walls[3], *lining)
     floor = quad((-a, -a - WALL, 0), (2 * a, 0, 0), (0, 2 * a + WALL, 0))
-    assembly.add(material(rng, f"floor {room}"), floor.transformed(T))
-    assembly.add(material(rng, f"ceiling {room}"), floor.translated(0, 0, h).transformed(T))
+    assembly.at(T).add(material(rng, f"floor {room}"), floor)
+    assembly.at(T).add(material(rng, f"ceiling {room}"), floor.translated(0, 0, h))
     fabric = material(rng, f"fabric {room}")
     corners = [(-1.65, -1.6), (1.65, -1.6), (1.65, 1.6), (-1.65, 1.6)]
     order = rng.permutation(4)
@@ -138,17 +139,17 @@ def _room(assembly: Assembly, room: int, rng: np.random.Generator) -> None:
         x, y = np.array(corners[order[k]]) + rng.uniform(-0.1, 0.1, 2)
         return T @ placed((float(x), float(y)), yaw + rng.uniform(-0.2, 0.2))
 
-    furniture.chair(assembly, fabric, near(0, rng.uniform(0, 6)))
-    furniture.plant(assembly, near(1, 0.0), rng)
+    furniture.chair(assembly.at(near(0, rng.uniform(0, 6))), fabric)
+    furniture.plant(assembly.at(near(1, 0.0)), rng)
     x = rng.uniform(-1.2, 1.2)
     if rng.random() < 0.5:
-        household.sofa(assembly, fabric, T @ placed((float(x) / 2, a - 0.5), -np.pi / 2))
+        household.sofa(assembly.at(T @ placed((float(x) / 2, a - 0.5), -np.pi / 2)), fabric)
     else:
-        household.shelf(assembly, T @ placed((float(x), a - 0.01), -np.pi / 2), rng)
+        household.shelf(assembly.at(T @ placed((float(x), a - 0.01), -np.pi / 2)), rng)
     size = tuple(rng.uniform((0.4, 0.6, 0.7), (0.5, 1.2, 1.9)).tolist())
     side, turn = (-a, 0.0) if rng.random() < 0.5 else (a, np.pi)
     at = T @ placed((side, float(rng.uniform(-0.8, 0.8))), turn)
-    household.cabinet(assembly, household.OAK, at, size)
+    household.cabinet(assembly.at(at), household.OAK, size)
 
 
 def _corridor(assembly: Assembly, rooms: int, rng: np.random.Generator) -> None:
@@ -256,10 +257,7 @@ def image_of(
     scene: Scene, camera: Pinhole, T: Float64, k: int, rng: np.random.Generator
 ) -> RangeFrame:
     """Image `k` of a camera with noise, at a pose (4, 4)."""
-    rays = np.concatenate(
-        [camera.rays().astype(float), np.ones((camera.height, camera.width, 1))], -1
-    )
-    rays = rays.reshape(-1, 3)
+    rays = homogeneous(camera.rays().reshape(-1, 2))
     lengths = np.linalg.norm(rays, axis=1)
     directions = rays / lengths[:, None] @ T[:3, :3].T
     hits = scene.cast(T[:3, 3], directions)

@@ -29,7 +29,6 @@ from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, ray_lengths, scaled
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.record import RecordingPlan
@@ -68,11 +67,7 @@ def film(scene: str, camera: str, seed: int, raw, *, still=False, well=None, wal
     if scene == "corridor" or walk is not None:
         effects = effects.without("wrap")  # longer than the ambiguity range of some cameras
     plan = RecordingPlan(built, sequence, model, effects, seed, np.asarray(raw))
-    factory = plan.correction
-    return [
-        replace(f, index=k, depth=corrected_depth(factory, f.camera, f.depth, f.depth_kind))
-        for k, f in enumerate(rendered.frame for rendered in plan.frames(None))
-    ]
+    return [*plan.corrected_frames()]
 
 
 def clean(camera: str, k: int) -> Frames:

@@ -28,9 +28,10 @@ from scipy.ndimage import gaussian_filter1d
 
 import sequences
 import verdict
-from pairs import roc_area
 from robustness import OURS, agreement, ours, peer, peer_methods
+from scoring import roc_area
 from tofuse.apps.jobs.judging import judge
+from tofuse.apps.jobs.pose_scale import with_scale
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import TofuseError
 from tofuse.engine.frames.recording import Recording
@@ -82,9 +83,7 @@ def jumping(poses: Float64, times: Float64, rng: np.random.Generator, size: floa
 
 def scaled(poses: Float64, times: Float64, rng: np.random.Generator, size: float) -> Float64:
     """Poses with a scale error."""
-    out = poses.copy()
-    out[:, :3, 3] *= 1 + size * SCALE
-    return out
+    return with_scale(poses, 1 + size * SCALE)
 
 
 def late(poses: Float64, times: Float64, rng: np.random.Generator, size: float) -> Float64:
@@ -101,8 +100,7 @@ def smoothed(poses: Float64, times: Float64, rng: np.random.Generator, size: flo
     out[:, :3, 3] = gaussian_filter1d(poses[:, :3, 3], size * SMOOTHED, axis=0, mode="nearest")
     R = poses[:, :3, :3].reshape(-1, 9)
     mean = gaussian_filter1d(R, size * SMOOTHED, axis=0, mode="nearest")
-    U, _, V = np.linalg.svd(mean.reshape(-1, 3, 3))
-    out[:, :3, :3] = U @ V
+    out[:, :3, :3] = se3.nearest_rotation(mean.reshape(-1, 3, 3))
     return out
 
 

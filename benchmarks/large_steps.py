@@ -27,6 +27,7 @@ from tofuse.engine.arrays import Float64
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import sequences
+from scoring import roc_area
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import RangeFrame
@@ -171,13 +172,6 @@ def decoys(all_taken: list[Views], options: SearchOptions, max_pairs: int) -> li
     return outcomes
 
 
-def roc_area(right: list[Outcome], wrong: list[Outcome]) -> float:
-    """Area under the ROC curve of the probability."""
-    a = np.array([outcome.probability for outcome in right])[:, None]
-    b = np.array([outcome.probability for outcome in wrong])[None]
-    return float(((a > b) + 0.5 * (a == b)).mean()) if a.size and b.size else float("nan")
-
-
 def summary(outcomes: list[Outcome]) -> str:
     """Summarise how many are right, right and accepted, and wrong but accepted."""
     right = sum(o.right for o in outcomes)
@@ -320,10 +314,11 @@ def print_search(names: list[str], data: Path, modes: list[str], max_pairs: int)
         bare = decoys([without_albedo(views) for views in taken], options, max_pairs)
         decoy_outcomes = decoys(taken, options, max_pairs)
         print_row("pairs without overlap", bare, decoy_outcomes)
-        right = [o for o in outcomes if o.right]
-        wrong = [o for o in outcomes if not o.right] + decoy_outcomes
-        print(f"\n{len(right)} right answers, {len(wrong)} wrong ones; ROC area:", end=" ")
-        print(f"probability {roc_area(right, wrong):.3f}")
+        every = outcomes + decoy_outcomes
+        right = np.array([o.right for o in outcomes] + [False] * len(decoy_outcomes))
+        area = roc_area(np.array([o.probability for o in every]), right)
+        print(f"\n{right.sum()} right answers, {(~right).sum()} wrong ones; ", end="")
+        print(f"ROC area: probability {area:.3f}")
 
 
 if __name__ == "__main__":

@@ -31,12 +31,10 @@ from tofuse.engine.frames.depth_counts import depth_from_counts
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.formats.recordings.open import open_recording
-from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.phone import PhonePlan
-from tofuse.lab.simulation.record import RecordingPlan
+from tofuse.lab.simulation.record import RecordingPlan, corrected
 from tofuse.lab.world import scene as scenes
 
 CAMERAS = {
@@ -130,7 +128,7 @@ def simulated(case: Case, camera: str, seed: int, focal: float) -> Taken:
     made = RecordingPlan(scene, sequence, model, effects, seed, np.arange(case.frames))
     true = made.model.camera
     stated = replace(true, fx=focal * true.fx, fy=focal * true.fy)
-    factory = sensor.factory_correction(model, effects)
+    factory = made.correction
     times = made.raw / case.rate_hz
     phone = PhonePlan(scene, sequence, times, seed=seed, depth=true, color_every=0)
     frames: list[RangeFrame] = []
@@ -142,8 +140,7 @@ def simulated(case: Case, camera: str, seed: int, focal: float) -> Taken:
             depth = depth_from_counts(shot.depth, 0.001)
             frame = RangeFrame(frame.index, frame.timestamp, true, depth)
         else:
-            depth = corrected_depth(factory, frame.camera, frame.depth, frame.depth_kind)
-            frame = replace(frame, depth=depth)
+            frame = corrected(frame, factory)
         z = replace(rendered.frame, depth=rendered.depth).z.astype(float)[..., None]
         exact = np.where(z > 0, np.concatenate([z * true.rays(), z], -1), np.nan)
         points.append(exact @ T[:3, :3].T + T[:3, 3])

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, triangles
 from tofuse.lab.scenes.composition import placed
 from tofuse.lab.world import mesh as meshes
 from tofuse.lab.world.mesh import Mesh
@@ -75,16 +75,6 @@ def room_pair(seed: int) -> Pair:
 # ---- Symmetric bodies ----------------------------------------------------------------------------
 
 
-def sampled(mesh: Mesh, count: int, rng: np.random.Generator) -> Float64:
-    """(count, 3) points on a mesh, uniform over its area."""
-    a, b, c = np.moveaxis(mesh.corners(), 1, 0)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    face = rng.choice(len(area), count, p=area / area.sum())
-    u, v = rng.random((2, count, 1))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    return a[face] + u * (b - a)[face] + v * (c - a)[face]
-
-
 def _prism(corners: int, radius: float = 0.3, height: float = 0.5) -> Mesh:
     profile = [(0, 0), (radius, 0), (radius, height), (0, height)]
     return meshes.lathe(profile, corners).translated(0, 0, -height / 2)
@@ -144,7 +134,7 @@ def symmetric_pairs() -> Iterator[tuple[str, Callable[[int], Pair]]]:
                 rng = np.random.default_rng([seed, 21])
                 w = np.radians(degrees) * np.eye(3)["xyz".index(axis)]
                 T = se3.exp([0, 0, 0, *w])
-                world = sampled(make(), 2 * POINTS, rng)
+                world = triangles.random_points(make().corners(), 2 * POINTS, rng)
                 source, target = seen(world[:POINTS], T, rng), seen(world[POINTS:], np.eye(4), rng)
                 return Pair(source, target, T)
 

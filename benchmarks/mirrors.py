@@ -21,6 +21,7 @@ from tofuse.apps.mirrors import find_mirrors
 from tofuse.apps.mirrors.openings import Plane
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous, unit_rays
 from tofuse.engine.results import Reconstruction
 from tofuse.lab.simulation.mirrors import Mirror, hang_mirror
 from tofuse.lab.world import scene as scenes
@@ -121,8 +122,7 @@ def shown(case: Case, recording: tofuse.Recording) -> tuple[int, float]:
     assert mirror is not None
     n = mirror.normal
     poses = [case.sequence.T_room_camera(k / case.one.rate_hz) for k in range(case.one.frames)]
-    xy = camera.rays().reshape(-1, 2).astype(float)
-    rays = np.c_[xy, np.ones(len(xy))] / np.sqrt(1 + (xy**2).sum(1))[:, None]
+    rays = unit_rays(camera.rays().reshape(-1, 2))
     hits, points, frames = [], [], []
     for k, T in enumerate(poses):
         d = rays @ T[:3, :3].T
@@ -293,7 +293,7 @@ def floor(paths: list[str]) -> None:
         recording = tofuse.open(path)
         frame = recording[0]
         depth = np.median([recording[k].z for k in range(len(recording))], axis=0)
-        rays = np.concatenate([frame.camera.rays(), np.ones((*depth.shape, 1))], -1).astype(float)
+        rays = homogeneous(frame.camera.rays())
         points = depth[..., None] * rays
         valid = frame.valid & (depth > 0.3)
         lengths = np.linalg.norm(rays, axis=-1)

@@ -38,12 +38,12 @@ from tofuse.engine.cameras.cameras import ray_lengths
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
 from tofuse.engine.sensor.multipath_correction import Multipath, MultipathCorrector
-from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation import record
 from tofuse.lab.simulation.effects import Effects, Flag
@@ -80,9 +80,7 @@ def simulated(scene: str, effects: Effects, albedo: float | None = None) -> Case
     case = Case()
     for raw in np.linspace(plan.raw[0], plan.raw[-1], FRAMES).astype(int):
         rendered = render(plan.scene, plan.sequence, plan.model, int(raw), effects=effects)
-        frame = rendered.frame
-        depth = corrected_depth(correction, frame.camera, frame.depth, frame.depth_kind)
-        frame = replace(frame, depth=depth)
+        frame = record.corrected(rendered.frame, correction)
         fixed = apply(corrector, frame, case)
         length = ray_lengths(frame.camera).astype(float)
         good = frame.valid & (rendered.depth > 0) & (rendered.flags & np.uint16(GROSS) == 0)
@@ -116,8 +114,7 @@ def planes_of(depth: Float32, frame: RangeFrame) -> list[Bool]:
 
     Pixels on one plane have the same normal.
     """
-    rays = frame.camera.rays().astype(float)
-    points = np.concatenate([rays, np.ones((*depth.shape, 1))], -1) * depth[..., None]
+    points = homogeneous(frame.camera.rays()) * depth[..., None]
     down, right = np.gradient(points, axis=(0, 1))
     normals = np.cross(right, down)
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)

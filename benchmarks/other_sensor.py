@@ -21,6 +21,7 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.lab.scenes.composition import Assembly, placed, shell
 from tofuse.lab.scenes.furniture import chair, desk
 from tofuse.lab.world import mesh as meshes
@@ -263,7 +264,7 @@ class _Images:
         fine = Pinhole(
             2 * s.width, 2 * s.height, 2 * c.fx, 2 * c.fy, 2 * c.cx + 0.5, 2 * c.cy + 0.5
         )
-        rays = np.concatenate([fine.rays(), np.ones((*fine.rays().shape[:2], 1))], 2)
+        rays = homogeneous(fine.rays())
         self.z_of_range = 1 / np.linalg.norm(rays, axis=2)
         self.rays = rays * self.z_of_range[..., None]
 

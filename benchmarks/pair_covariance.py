@@ -27,7 +27,7 @@ import argparse
 import pickle
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -38,16 +38,14 @@ from tofuse.engine.arrays import Float32, Float64
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import tofuse
-from cloud_kinds import Pair, any_motion, scanner_rays
+from cloud_kinds import OBJECT_M, Pair, any_motion, scanner_rays
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.geometry import se3
-from tofuse.formats.cameras.calibration_files import corrected_depth
-from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
-from tofuse.lab.simulation.render import render
+from tofuse.lab.simulation.record import RecordingPlan
 from tofuse.lab.world import scene as scenes
 
 OUT = Path(__file__).resolve().parent / "out" / "pair_covariance"
@@ -62,8 +60,6 @@ ROOMS = (
     ("corner", "pico-flexx", (5, 30)),
 )
 OBJECTS = (("torso", "sr4000", (3, 12)), ("box", "sr4000", (5, 20)))
-# A rotating object stands in front of a static background.
-_OBJECT_M = 1.6
 FAMILIES = (
     "range images",
     "camera clouds",
@@ -125,7 +121,7 @@ def _of_objects(seed: int) -> Iterator[Case]:
     for kind, camera, gap in OBJECTS:
         rng = np.random.default_rng([seed, 12, len(kind)])
         views, true = _views(kind, camera, gap, seed, rng)
-        near = [v.points[np.linalg.norm(v.points, axis=1) < _OBJECT_M] for v in views]
+        near = [v.points[np.linalg.norm(v.points, axis=1) < OBJECT_M] for v in views]
         if min(map(len, near)) < 300:
             continue
         target, source = (_thinned(points, rng) for points in near)
@@ -173,14 +169,9 @@ def _views(
     built, sequence = scenes.build(kind, seed=seed, texture=bool(rng.random() > 0.2))
     step = int(rng.integers(gap[0], gap[1] + 1))
     first = int(rng.integers(0, sequence.frames - step))
-    factory = sensor.factory_correction(model, effects)
-    frames = []
-    for index in (first, first + step):
-        raw = render(built, sequence, model, index, effects=effects, seed=seed).frame
-        depth = corrected_depth(factory, raw.camera, raw.depth, raw.depth_kind)
-        frames.append(replace(raw, depth=depth))
-    t, s = first / sequence.frame_rate_hz, (first + step) / sequence.frame_rate_hz
-    return frames, np.asarray(sequence.T_world_camera(s, t))
+    raw = np.array([first, first + step])
+    made = RecordingPlan(built, sequence, model, effects, seed, raw)
+    return [*made.corrected_frames()], made.poses[1]
 
 
 def _thinned(points: Float32, rng: np.random.Generator, max_points: int = POINTS) -> Float32:

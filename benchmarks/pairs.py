@@ -23,14 +23,13 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import os
-import shutil
 import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 
@@ -38,10 +37,12 @@ from tofuse.engine.arrays import Bool, Float64, Intp
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+import sequences
 import tofuse
 from pair_views import TAKEN, recorded
 from peers import o3d_global
-from sequences import DATA, OUT, kinect_loop
+from scoring import roc_area
+from sequences import DATA, kinect_loop
 from tofuse.engine.alignment.base import Registration
 from tofuse.engine.clouds.cloud_pair import register_clouds
 from tofuse.engine.clouds.pair import AnyPair
@@ -61,8 +62,7 @@ from tofuse.engine.search.pose_probability import (
 from tofuse.engine.search.view_pair import follow, register_pair
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
-from tofuse.formats.recordings.open import open_recording
-from tofuse.lab.simulation.record import simulate
+from tofuse.lab.simulation.record import PlanOptions
 
 RIGHT_M, RIGHT_DEG = 0.1, 4.0
 # Ridge penalty: keeps coefficients finite where few pairs are perfectly separable.
@@ -96,30 +96,11 @@ class Scene:
     family: str
 
 
-def _simulated(name: str, scene: str, **options: object) -> Callable[[Path], Recording]:
-    def opened(_data: Path) -> Recording:
-        path = OUT / "recordings" / "pairs" / name
-        if not path.is_dir():
-            unfinished = path.with_suffix(".part")
-            shutil.rmtree(unfinished, ignore_errors=True)
-            unfinished.parent.mkdir(parents=True, exist_ok=True)
-            simulate(scene, unfinished, **options)  # type: ignore[arg-type]
-            os.replace(unfinished, path)
-        return open_recording(path)
-
-    return opened
-
-
-def _kitchen(data: Path) -> Recording:
-    path = data / "sevenscenes_kitchen"
-    if not path.is_dir():
-        raise FileNotFoundError(path)
-    return open_recording(path)
-
-
-def _sim(name: str, title: str, scene: str, every: int, frames: int, **options: object) -> Scene:
+def _sim(
+    name: str, title: str, scene: str, every: int, frames: int, **options: Unpack[PlanOptions]
+) -> Scene:
     family = "room" if "room" in scene else scene.removesuffix("-alike")
-    opened = _simulated(name, scene, every=every, frames=frames, **options)
+    opened = sequences.simulated(f"pairs/{name}", scene, **options, every=every, frames=frames)
     gaps = tuple(k for k in (1, 2, 3, 4, 6) if k < frames - 1)
     return Scene(name, title, opened, every, gaps, family)
 
@@ -142,7 +123,14 @@ SCENES = {
         _walk("flat-o3r", "Walk through a flat, ifm O3R", "ifm-o3r", 12),
         _sim("rail", "Rail, pico flexx", "rail", 40, 7, camera="pico-flexx"),
         _sim("hall", "Hall, ifm O3R", "hall", 12, 12, camera="ifm-o3r"),
-        Scene("kitchen", "7-Scenes kitchen, Kinect v1", _kitchen, 2, (10, 30, 60), "kitchen"),
+        Scene(
+            "kitchen",
+            "7-Scenes kitchen, Kinect v1",
+            sequences.recorded("sevenscenes_kitchen"),
+            2,
+            (10, 30, 60),
+            "kitchen",
+        ),
         Scene("kinect", "Loop round boxes, Kinect v2", kinect_loop, 1, (1, 2, 3), "boxes"),
     )
 }
@@ -361,12 +349,6 @@ def _print_worth(found: list[Outcome]) -> None:
     far = sum(o.accepted and (o.metres > 3 * RIGHT_M or o.degrees > 3 * RIGHT_DEG) for o in found)
     print(f"{wrong.sum()}, by more than three times that {far}")
     print_calibration(p, right)
-
-
-def roc_area(p: Float64, right: Bool) -> float:
-    """Area under the ROC curve of the probability."""
-    a, b = p[right][:, None], p[~right][None]
-    return float(((a > b) + 0.5 * (a == b)).mean()) if a.size and b.size else float("nan")
 
 
 def print_calibration(p: Float64, right: Bool) -> None:

@@ -42,6 +42,7 @@ from tofuse.engine.frames.recording import Recording, evenly_spaced
 from tofuse.engine.fusion import display_surface
 from tofuse.engine.fusion.tsdf import fuse_surface
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.mapping.adaptation import Prior, adapted, with_prior
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
@@ -155,8 +156,7 @@ def _fit(a: Float64, b: Float64, chosen: Intp, focal: float) -> _Solution | None
     if E is None or E.shape != (3, 3):
         return None
     _, R, t, _ = cv2.recoverPose(E, a[chosen], b[chosen], np.eye(3), mask=mask)
-    ones = np.ones((len(a), 1))
-    h_a, h_b = np.hstack([a, ones]), np.hstack([b, ones])
+    h_a, h_b = homogeneous(a), homogeneous(b)
 
     def residuals(x: Float64) -> Float64:
         E = se3.hat(x[3:] / np.linalg.norm(x[3:])) @ cv2.Rodrigues(x[:3])[0]

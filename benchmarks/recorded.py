@@ -11,10 +11,10 @@ import numpy as np
 
 from scoring import Tolerance
 from sequences import kinect_loop
+from sequences import recorded as _folder
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry import se3
-from tofuse.formats.recordings.open import open_recording
 
 # Reads the candidate references of a recording; empty if there is none.
 References = Callable[[Path, Recording], list[Float64]]
@@ -49,16 +49,6 @@ class Recorded:
     def tolerance(self) -> Tolerance:
         """Tolerance of a right pose, including the uncertainty of the reference."""
         return Tolerance().widened(self.reference_m, np.radians(self.reference_deg))
-
-
-def _folder(*parts: str) -> Callable[[Path], Recording]:
-    def opened(data: Path) -> Recording:
-        path = data.joinpath(*parts)
-        if not path.exists():
-            raise FileNotFoundError(path)
-        return open_recording(path)
-
-    return opened
 
 
 def _own(_data: Path, recording: Recording) -> list[Float64]:

@@ -50,6 +50,7 @@ from tofuse.engine.compute.thread_pool import threads as using_threads
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.stopwatch import Stopwatch
 from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.formats.recordings.open import open_recording
@@ -67,8 +68,7 @@ def made_frames(columns: int, count: int) -> list[RangeFrame]:
     """Frames of a room of 5 x 4 x 3 m with two boxes, with 2 mm of noise at 1 m."""
     rows = columns * 3 // 4
     camera = Pinhole(columns, rows, 0.9 * columns, 0.9 * columns, columns / 2 - 0.5, rows / 2 - 0.5)
-    rays = camera.rays().astype(float)
-    directions = np.concatenate([rays, np.ones((rows, columns, 1))], -1).reshape(-1, 3)
+    directions = homogeneous(camera.rays().reshape(-1, 2))
     frames = []
     for k in range(count):
         T = made_pose(k)

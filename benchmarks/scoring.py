@@ -352,3 +352,9 @@ def score(parts: list[Part], truth: Truth) -> Score:
         joins_by_motion=by_motion,
         ate_m=ate,
     )
+
+
+def roc_area(score: Float64, positive: Bool) -> float:
+    """Area under the ROC curve: fraction of positive-negative pairs in the right order."""
+    a, b = score[positive][:, None], score[~positive][None]
+    return float(((a > b) + 0.5 * (a == b)).mean()) if a.size and b.size else float("nan")

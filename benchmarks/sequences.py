@@ -6,15 +6,17 @@ camera errors and factory correction, are created once and kept.
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 
+from made_once import made_once
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.base import Filter, apply_filters
@@ -26,7 +28,7 @@ from tofuse.engine.quality.map_agreement import poses_of_frames
 from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.methods.filters_foreground import Foreground
-from tofuse.lab.simulation.record import simulate
+from tofuse.lab.simulation.record import PlanOptions, simulate
 
 HERE = Path(__file__).resolve().parent
 OUT = HERE / "out"
@@ -116,10 +118,12 @@ def _images(frames: Iterable[Frame]) -> tuple[RangeFrame, ...]:
     return tuple(replace(frame) for frame in frames if isinstance(frame, RangeFrame))
 
 
-def _recorded(*parts: str) -> Callable[[Path], Recording]:
+def recorded(*parts: str) -> Callable[[Path], Recording]:
+    """Return a function that opens a recording below the folder of recorded sequences."""
+
     def opened(data: Path) -> Recording:
         path = data.joinpath(*parts)
-        if not path.is_dir():
+        if not path.exists():
             raise FileNotFoundError(path)
         return open_recording(path)
 
@@ -128,21 +132,18 @@ def _recorded(*parts: str) -> Callable[[Path], Recording]:
 
 def kinect_loop(data: Path) -> Recording:
     """Stop-and-go views, with the poses of the robot that carried the camera."""
-    recording = _recorded("kinectv2_loop", "recording")(data)
+    recording = recorded("kinectv2_loop", "recording")(data)
     times, poses = read_tum(Path(recording.path) / "reference_poses.txt")
     recording.source.reference = poses_of_frames(recording.timestamps, times, poses)
     return recording
 
 
-def _simulated(name: str, scene: str, *, texture: bool = True) -> Callable[[Path], Recording]:
+def simulated(name: str, scene: str, **options: Unpack[PlanOptions]) -> Callable[[Path], Recording]:
+    """Return a function that opens a simulated recording, which is made at the first call."""
+
     def opened(_data: Path) -> Recording:
         path = OUT / "recordings" / name
-        if not path.is_dir():
-            unfinished = path.with_suffix(".part")
-            shutil.rmtree(unfinished, ignore_errors=True)
-            simulate(scene, unfinished, texture=texture)
-            os.replace(unfinished, path)
-        return open_recording(path)
+        return open_recording(made_once(path, partial(simulate, scene, **options)))
 
     return opened
 
@@ -151,27 +152,25 @@ _SR4000 = "simulated SR4000, 176 x 144"
 
 KINDS = {
     "kitchen": _Kind(
-        "7-Scenes kitchen, Kinect v1, 640 x 480", _recorded("sevenscenes_kitchen"), False
+        "7-Scenes kitchen, Kinect v1, 640 x 480", recorded("sevenscenes_kitchen"), False
     ),
-    "iphone": _Kind(
-        "Chair, iPhone LiDAR, 256 x 192", _recorded("iphone_chair_3dscannerapp"), False
-    ),
+    "iphone": _Kind("Chair, iPhone LiDAR, 256 x 192", recorded("iphone_chair_3dscannerapp"), False),
     "kinect": _Kind("Loop round boxes, Kinect v2, 512 x 424", kinect_loop, False),
     "corridor": _Kind(
-        "Corridor, SR4000, 176 x 144", _recorded("sr4000_corridor"), False, referenced=False
+        "Corridor, SR4000, 176 x 144", recorded("sr4000_corridor"), False, referenced=False
     ),
-    "room": _Kind(f"Furnished room, {_SR4000}", _simulated("room", "room"), True),
+    "room": _Kind(f"Furnished room, {_SR4000}", simulated("room", "room"), True),
     "empty-room": _Kind(
-        f"Empty room, textured, {_SR4000}", _simulated("empty-room", "empty-room"), True
+        f"Empty room, textured, {_SR4000}", simulated("empty-room", "empty-room"), True
     ),
     "empty-room-uniform": _Kind(
         f"Empty room, uniform albedo, {_SR4000}",
-        _simulated("empty-room-uniform", "empty-room", texture=False),
+        simulated("empty-room-uniform", "empty-room", texture=False),
         True,
     ),
-    "rail": _Kind(f"Rail, {_SR4000}", _simulated("rail", "rail"), True),
-    "torso": _Kind(f"Torso, turned, {_SR4000}", _simulated("torso", "torso"), True, 2.2),
-    "box": _Kind(f"Box, turned, {_SR4000}", _simulated("box", "box"), True, 1.8),
+    "rail": _Kind(f"Rail, {_SR4000}", simulated("rail", "rail"), True),
+    "torso": _Kind(f"Torso, turned, {_SR4000}", simulated("torso", "torso"), True, 2.2),
+    "box": _Kind(f"Box, turned, {_SR4000}", simulated("box", "box"), True, 1.8),
 }
 
 

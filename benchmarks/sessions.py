@@ -15,15 +15,16 @@ rooms, and prints after each merge the ATE of the map and of its worst session.
 from __future__ import annotations
 
 import argparse
-import shutil
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from unittest import mock
 
 import numpy as np
 
+from made_once import made_once
 from tofuse.apps.jobs.merging import MergeOptions, merge_files
 from tofuse.apps.jobs.run_options import Options
 from tofuse.apps.jobs.running import run
@@ -98,11 +99,7 @@ class Tour:
     def recording(self) -> tuple[Path, Float64]:
         """Folder of the recording, and (N, 4, 4) true T_flat_camera."""
         made, folder = self.plan(), OUT / self.name
-        if not folder.is_dir():
-            unfinished = folder.with_name(f"{folder.name}.part")
-            shutil.rmtree(unfinished, ignore_errors=True)
-            write(made, unfinished)
-            unfinished.rename(folder)
+        made_once(folder, partial(write, made))
         start = made.raw[0] / made.sequence.frame_rate_hz
         return folder, made.sequence.T_room_camera(start) @ made.poses
 
@@ -123,7 +120,8 @@ def with_chair(furnish: Furnish, moved: float) -> Furnish:
 
     def furnished(assembly: Assembly, T: Float64, rng: np.random.Generator, room: int) -> None:
         furnish(assembly, T, rng, room)
-        furniture.chair(assembly, flat.FABRICS[3], T @ placed((0.9 + moved, -1.3), 2.2), arms=False)
+        moved_chair = assembly.at(T @ placed((0.9 + moved, -1.3), 2.2))
+        furniture.chair(moved_chair, flat.FABRICS[3], arms=False)
 
     return furnished
 

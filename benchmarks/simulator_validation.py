@@ -18,12 +18,12 @@ from time import perf_counter
 import numpy as np
 
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.formats.images.images import read_image
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CAMERAS, camera_model
+from tofuse.lab.simulation.record import corrected
 from tofuse.lab.simulation.render import render
 from tofuse.lab.world import scene as scenes
 
@@ -56,18 +56,7 @@ def still(
         taken = []
         for i in range(frames):
             frame = render(built, fixed, model, i, effects=effects, seed=int(k)).frame
-            depth = corrected_depth(correction, frame.camera, frame.depth, frame.depth_kind)
-            taken.append(
-                RangeFrame(
-                    i,
-                    frame.timestamp,
-                    frame.camera,
-                    depth,
-                    frame.depth_kind,
-                    frame.amplitude_image,
-                    frame.confidence_image,
-                )
-            )
+            taken.append(corrected(frame, correction))
         out.append(taken)
     return out
 
@@ -241,7 +230,7 @@ def print_correction() -> None:
         correction = sensor.factory_correction(model, effects)
         rendered = render(built, sequence, model, 20, effects=effects)
         frame = rendered.frame
-        depth = corrected_depth(correction, frame.camera, frame.depth, frame.depth_kind)
+        depth = corrected(frame, correction).depth
         clean = (rendered.flags == 0) & (frame.depth > 0)
         rms = [
             1e3 * np.sqrt(((d - rendered.depth)[clean].astype(float) ** 2).mean())

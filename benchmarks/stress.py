@@ -10,20 +10,22 @@ the other.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
+from made_once import made_once
 from scoring import Truth
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.cameras.cameras import BrownConrady
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
@@ -157,12 +159,7 @@ def take(
     elif motion == "close-up":
         path = close_up(made.sequence.camera_path, start + 2.0, paths.look_at(*scene.bare))
         made = replace(made, sequence=replace(made.sequence, camera_path=path))
-    if not folder.is_dir():
-        unfinished = folder.with_name(f"{folder.name}.part")
-        shutil.rmtree(unfinished, ignore_errors=True)
-        write(made, unfinished)
-        unfinished.rename(folder)
-    recording = open_recording(folder)
+    recording = open_recording(made_once(folder, partial(write, made)))
     images = tuple(frame for frame in recording if isinstance(frame, RangeFrame))
     if not falloff:
         images = tuple(evenly_lit(frame, made.model.transmission) for frame in images)
@@ -243,7 +240,7 @@ def groups(frames: Sequence[RangeFrame], poses: Float64, unusable: Sequence[int]
         xy = frame.camera.rays()[pick].reshape(-1, 2).astype(float)
         flat = z[pick].reshape(-1)
         good = (flat > 0) & np.isfinite(xy).all(1)
-        clouds.append(np.column_stack([xy[good], np.ones(good.sum())]) * flat[good, None])
+        clouds.append(homogeneous(xy[good]) * flat[good, None])
         images.append(z)
     fraction = np.zeros((n, n))
     seeing = [k for k in range(n) if k not in set(unusable) and len(clouds[k]) > 20]

@@ -16,10 +16,8 @@ from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.lab.scenes.composition import Assembly, placed, shell
 from tofuse.lab.scenes.furniture import chair, plant
-from tofuse.lab.simulation import sensor
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.record import RecordingPlan
@@ -495,16 +493,8 @@ def record(one: Unusual, seed: int, *without: str) -> Recording:
     model = replace(one.camera, frame_rate_hz=one.rate_hz)
     effects = Effects().without(*(without or ("multipath", "smear")))
     made = RecordingPlan(scene, sequence, model, effects, seed, np.arange(one.frames))
-    factory = sensor.factory_correction(model, effects)
     frames = [
-        replace(
-            r.frame,
-            depth=_within(
-                corrected_depth(factory, r.frame.camera, r.frame.depth, r.frame.depth_kind),
-                one.range_m,
-            ),
-        )
-        for r in made.frames(None)
+        replace(frame, depth=_within(frame.depth, one.range_m)) for frame in made.corrected_frames()
     ]
     metadata = {
         "frame_rate_hz": one.rate_hz,

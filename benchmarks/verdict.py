@@ -24,6 +24,7 @@ import argparse
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ import numpy as np
 import other_sensor
 import sequences
 import stress
+from made_once import made_once
 from recorded import RECORDED
 from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.apps.jobs.run_options import Options, resolve
@@ -120,21 +122,17 @@ class Run:
 
 def recorded(scene: str, camera: str, seed: int, *, multipath: bool) -> Recording:
     """A simulated recording, created once and kept."""
-    path = OUT / f"{scene}_{camera}_{seed}_{int(multipath)}"
-    if not path.is_dir():
-        unfinished = path.with_suffix(".part")
-        effects = Effects(multipath=multipath)
-        simulate(
-            scene,
-            unfinished,
-            camera=camera,
-            seed=seed,
-            every=SCENES[scene],
-            frames=FRAMES,
-            effects=effects,
-        )
-        unfinished.rename(path)
-    return open_recording(path)
+    make = partial(
+        simulate,
+        scene,
+        camera=camera,
+        seed=seed,
+        every=SCENES[scene],
+        frames=FRAMES,
+        effects=Effects(multipath=multipath),
+    )
+    name = f"{scene}_{camera}_{seed}_{int(multipath)}"
+    return open_recording(made_once(OUT / name, make))
 
 
 def variants(recording: Recording) -> Iterator[tuple[str, Recording]]:

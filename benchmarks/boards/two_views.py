@@ -14,7 +14,7 @@ import numpy as np
 
 import pairs
 from boards import Board, Score, default_made
-from cloud_pairs import OBJECT_M
+from cloud_kinds import OBJECT_M
 from peers import kiss_global, o3d_global
 from tofuse.engine.alignment.base import Registrar
 from tofuse.engine.arrays import Float64

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.cameras.cameras import Camera, Pinhole
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry.rays import homogeneous
 
 MAX_DEPTH_M = 12.0
 
@@ -71,8 +72,7 @@ class PinholeImages:
         c = self.camera
         assert isinstance(c, Pinhole)
         self.pinhole = Pinhole(c.width, c.height, c.fx, c.fy, c.cx, c.cy)
-        rays = self.pinhole.rays()
-        pixels = c.project(np.concatenate([rays, np.ones_like(rays[..., :1])], -1))
+        pixels = c.project(homogeneous(self.pinhole.rays()))
         columns, rows = np.round(np.moveaxis(np.nan_to_num(pixels, nan=-1), -1, 0)).astype(int)
         self._inside = (rows >= 0) & (rows < c.height) & (columns >= 0) & (columns < c.width)
         self._rows, self._columns = rows.clip(0, c.height - 1), columns.clip(0, c.width - 1)

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ray_casting import rays_at, to_plane
 from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align
 from tofuse.engine.alignment.step_kernels import spurious_information
 from tofuse.engine.alignment.uncertainty import (
@@ -27,16 +28,8 @@ CORNER = ((0.0, 0.0, 1.0, 2.6), (0.8, 0.0, 0.6, 2.0), (0.0, 0.85, 0.53, 1.8))
 
 def _depth(planes, T=None):
     """Depths (H, W) of planes n . X = d of the world, seen by a camera at T_world_camera."""
-    T = np.eye(4) if T is None else T
-    rays = CAMERA.rays().astype(float)
-    rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1)
-    depths = []
-    for *n, d in planes:
-        n = np.array(n) / np.linalg.norm(n)
-        along = rays @ (T[:3, :3].T @ n)
-        z = (d - n @ T[:3, 3]) / np.where(np.abs(along) > 1e-9, along, 1e-9)
-        depths.append(np.where(z > 0, z, np.inf))
-    return np.min(depths, 0)
+    rays = rays_at(np.eye(4) if T is None else T, CAMERA)
+    return np.min([to_plane(*rays, n / np.linalg.norm(n), d) for *n, d in planes], 0)
 
 
 def _view(index, planes, T=None, *, sigma=0.004, bend=None, light=None):

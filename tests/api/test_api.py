@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import tofuse
+from ray_casting import rays_at, to_plane
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
@@ -24,7 +25,6 @@ def arrays():
     from tofuse.engine.cameras.cameras import Pinhole
 
     camera = Pinhole(80, 60, 70.0, 70.0, 39.5, 29.5)
-    rays = np.concatenate([camera.rays().astype(float), np.ones((60, 80, 1))], -1)
     poses = se3.exp(np.linspace(0, 1, 6)[:, None] * [0.06, 0.02, 0.05, 0.02, 0.10, 0.03])
     planes = [
         ([0, 0, -1.0], -2.2),
@@ -34,14 +34,8 @@ def arrays():
     ]
     depth = []
     for T in poses:
-        z = np.full((60, 80), np.inf)
-        for normal, d in planes:
-            n = np.array(normal) / np.linalg.norm(normal)
-            world = rays @ T[:3, :3].T
-            with np.errstate(divide="ignore"):
-                hit = (d - n @ T[:3, 3]) / (world @ n)
-            z = np.minimum(z, np.where(hit > 0.05, hit, np.inf))
-        depth.append(z)
+        rays = rays_at(T, camera)
+        depth.append(np.min([to_plane(*rays, np.array(n), d) for n, d in planes], 0))
     noise = np.random.default_rng(3).normal(0, 0.001, (6, 60, 80))
     return (
         (np.array(depth) + noise).astype(np.float32),

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
+from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 
@@ -16,6 +19,36 @@ from tofuse.engine.compute import ahead
 @pytest.fixture(autouse=True)
 def on_path(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
+
+
+def test_imported_names_exist() -> None:
+    """Of the package and of other scripts, which are only read, as some need peers."""
+    missing = []
+    for path in sorted(BENCHMARKS.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.ImportFrom) or node.module is None:
+                continue
+            script = BENCHMARKS / f"{node.module.replace('.', '/')}.py"
+            names = {alias.name for alias in node.names}
+            if node.module.split(".")[0] == "tofuse":
+                module = importlib.import_module(node.module)
+                known = {n for n in names if hasattr(module, n) or find_spec(f"{node.module}.{n}")}
+            else:
+                known = set(names_in(script)) if script.exists() else names
+            missing += [f"{path.name}: {name}" for name in names - known]
+    assert missing == []
+
+
+def names_in(script: Path) -> Iterator[str]:
+    """Names that a script defines or imports at its top level."""
+    for node in ast.parse(script.read_text()).body:
+        for inner in ast.walk(node):
+            if isinstance(inner, ast.Name) and isinstance(inner.ctx, ast.Store):
+                yield inner.id
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            yield from (alias.asname or alias.name for alias in node.names)
 
 
 @pytest.mark.parametrize("script", ["tracking", "scaling", "end_to_end", "offline_system"])

@@ -15,6 +15,7 @@ from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.recording import Recording
+from tofuse.engine.geometry.rays import unit_rays
 from tofuse.formats.cameras.calibration_files import read_correction
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
@@ -43,8 +44,7 @@ def own_offsets() -> np.ndarray:
 def made_views(*, known: bool, constant: float = 0.0) -> list[PlaneView]:
     """Planes from 0.8 to 4 m, tilted in all directions."""
     rng = np.random.default_rng(7)
-    rays = np.concatenate([CAMERA.rays(), np.ones((36, 48, 1))], -1).reshape(-1, 3).astype(float)
-    directions = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    directions = unit_rays(CAMERA.rays().reshape(-1, 2))
     views = []
     for k, distance in enumerate(np.linspace(0.8, 4.0, 40)):
         tilt, around = rng.uniform(0.1, 0.7), rng.uniform(0, 2 * np.pi)

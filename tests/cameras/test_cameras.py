@@ -15,10 +15,12 @@ from tofuse.engine.cameras.cameras import (
     Pinhole,
     Rational,
     RayTable,
+    ray_lengths,
     scaled,
 )
 from tofuse.engine.cameras.depth_conversion import points_from_z, range_from_z, z_from_range
 from tofuse.engine.errors import InputError
+from tofuse.engine.geometry.rays import homogeneous, unit_rays
 
 PINHOLE = Pinhole(176, 144, 230.0, 231.0, 87.0, 71.5)
 BROWN = BrownConrady(176, 144, 230.0, 231.0, 87.0, 71.5, -0.3, 0.1, 0.001, -0.002, 0.01)
@@ -42,10 +44,18 @@ def test_projected_rays_give_pixels(camera: Camera) -> None:
     assert rays.dtype == np.float32
     assert not rays.flags.writeable
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-    points = np.concatenate([rays, np.ones_like(rays[..., :1])], -1) * 2.5
+    points = homogeneous(rays) * 2.5
     error = np.abs(camera.project(points) - np.stack([u, v], -1))
     assert np.isfinite(rays).all()
     assert error.max() < 1e-3
+
+
+def test_unit_rays_point_where_rays_do() -> None:
+    rays = FISHEYE.rays()
+    unit = unit_rays(rays)
+    np.testing.assert_allclose(np.linalg.norm(unit, axis=-1), 1, rtol=1e-12)
+    np.testing.assert_allclose(unit[..., :2] / unit[..., 2:], rays, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(unit[..., 2] * ray_lengths(FISHEYE), 1, rtol=1e-6)
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: f"{type(c).__name__}-{c.width}")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from ray_casting import rays_at
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.color import ColorView, measured_pairs, with_color
@@ -45,10 +46,9 @@ def floor_view(
     """Return the depth of a floor at z = 0 and its colour; without texture only noise."""
     frames = []
     for camera in (DEPTH, COLOR):
-        rays = np.concatenate([camera.rays(), np.ones((camera.height, camera.width, 1))], 2)
-        directions = rays @ T[:3, :3].T
-        z = -T[2, 3] / directions[..., 2]
-        frames.append((z, T[:3, 3] + directions * z[..., None]))
+        origin, directions = rays_at(T, camera)
+        z = -origin[2] / directions[..., 2]
+        frames.append((z, origin + directions * z[..., None]))
     image = np.full((COLOR.height, COLOR.width), 120.0)
     if floor is not None:
         places = np.moveaxis(frames[1][1][..., :2], 2, 0) / TEXEL_M + 500

@@ -21,6 +21,7 @@ from tofuse.apps.export.exporting import export
 from tofuse.apps.results.run_json import read_run_json
 from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
 from tofuse.engine.errors import OutputError
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.formats.geometry.ply import read_ply
 from tofuse.formats.poses.trajectory import read_tum, write_tum
 from tofuse.formats.poses.trajectory_formats import read_poses
@@ -65,11 +66,10 @@ def test_nerfstudio_depth_and_poses_reproduce_points(tmp_path: Path, camera: Cam
         assert depth.dtype == sigma.dtype == np.uint16
         z = depth * data["depth_unit_scale_factor"]
         T = np.array(frame["transform_matrix"])
-        rays = opencv_rays(data)
         seen = z > 0
         assert seen.mean() > (0.9 if kept else 0.7)
         # From OpenGL's axes to the world; then the plane is where the camera measured it.
-        local = np.concatenate([rays, np.ones((*z.shape, 1))], -1) * z[..., None] * [1, -1, -1]
+        local = homogeneous(opencv_rays(data)) * z[..., None] * [1, -1, -1]
         world = local[seen] @ T[:3, :3].T + T[:3, 3]
         camera_axes = (world - POSES[k, :3, 3]) @ POSES[k, :3, :3]
         off = np.abs(camera_axes @ NORMAL - DISTANCE - 0.1 * k)

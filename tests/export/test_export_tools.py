@@ -21,6 +21,7 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import quaternion, se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.formats.export.octomap import write_octomap
 from tofuse.formats.geometry.ply import read_ply, write_ply
 from written_run_json import change_run
@@ -35,8 +36,7 @@ def result(tmp_path: Path) -> Path:
     """Images of a plane, of which the first alone are used by `every=4`; its points, and sigma."""
     folder = made_result(tmp_path, CAMERA)
     z = plane(CAMERA, 0)
-    rays = np.concatenate([CAMERA.rays(), np.ones((*z.shape, 1))], -1)
-    points = (rays * z[..., None])[z > 0].astype(np.float32)
+    points = (homogeneous(CAMERA.rays()) * z[..., None])[z > 0].astype(np.float32)
     color = np.tile(np.uint8([200, 100, 50]), (len(points), 1))
     sigma = np.linspace(0.001, 0.01, len(points), dtype=np.float32)
     write_ply(folder / "cloud.ply", GeometryRecord(points, color=color, scalars={"sigma": sigma}))

@@ -6,7 +6,7 @@ central ray of each pixel hits.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import cv2
@@ -16,8 +16,8 @@ import pytest
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.background import Background
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry.rays import unit_rays
 from tofuse.engine.sensor.scattering import LensScattering
-from tofuse.formats.cameras.calibration_files import corrected_depth
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 
@@ -40,24 +40,19 @@ def shown(scene: str, camera: str = "sr4000", count: int = 7, off: tuple[str, ..
     every = {"torso": 222, "box": 570}[scene] // count
     effects = Effects().without(*off)
     made = plan(scene, camera=camera, every=every, frames=count, effects=effects)
-    frames = []
-    for rendered in made.frames(None):
-        f = rendered.frame
-        depth = corrected_depth(made.correction, f.camera, f.depth, f.depth_kind)
-        frames.append(replace(f, depth=depth, ambiguity_m=made.model.ambiguity_m))
-    rays = made.model.camera.rays()
-    ahead = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1).reshape(-1, 3)
-    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    rays = unit_rays(made.model.camera.rays())
+    shape = rays.shape[:2]
+    ahead = rays.reshape(-1, 3)
     masks, stands = [], []
     names = np.array([m.name for m in made.scene.materials] + [""])
     for k in range(count):
         t = k * every / made.sequence.frame_rate_hz
         T = made.sequence.T_room_camera(t)
         hits = made.scene.cast(T[:3, 3], ahead @ T[:3, :3].T, made.sequence.T_room_object(t))
-        seen = names[hits.surface].reshape(rays.shape[:2])
+        seen = names[hits.surface].reshape(shape)
         masks.append(np.isin(seen, OF_OBJECT[scene]))
         stands.append(seen == "stand")
-    return Shown(tuple(frames), tuple(masks), tuple(stands))
+    return Shown(tuple(made.corrected_frames()), tuple(masks), tuple(stands))
 
 
 def check(case: Shown, least: float) -> None:

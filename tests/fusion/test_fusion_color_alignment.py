@@ -11,6 +11,7 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion.color_alignment import Shown, aligned_poses
 from tofuse.engine.fusion.texture import TextureView, _Seen, textured
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 
 WALL = sheet(61, 45, 0.03)
 POSES = se3.exp(
@@ -33,8 +34,7 @@ def look(T: np.ndarray, fine: int = 4, gain: float = 1.0) -> tuple[RangeFrame, n
     v, u = np.mgrid[: 60 * fine, : 80 * fine]
     pixels = (np.stack([u, v], -1) + 0.5) / fine - 0.5
     rays = (pixels - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy]
-    rays = np.concatenate([rays, np.ones((*u.shape, 1))], -1)
-    away = rays @ T[:3, :3].T
+    away = homogeneous(rays) @ T[:3, :3].T
     z = (2.0 - T[2, 3]) / away[..., 2]
     grey = np.round(gain * light(away * z[..., None] + T[:3, 3])).clip(1, 255).astype(np.uint8)
     image = np.repeat(grey[..., None], 3, -1)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from parsed_glb import parse
+from ray_casting import rays_at
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion import atlas as atlas_module
@@ -56,10 +57,9 @@ def pattern(points: np.ndarray) -> np.ndarray:
 
 def look(T: np.ndarray, gain: float, *, hidden: float | None = None, lamp: bool = False):
     """An image of the wall at z = 2 m; occluded 0.5 m nearer where its x exceeds `hidden`."""
-    rays = np.concatenate([CAMERA.rays(), np.ones((60, 80, 1))], -1)
-    away = rays @ T[:3, :3].T
-    z = (2.0 - T[2, 3]) / away[..., 2]
-    at = away * z[..., None] + T[:3, 3]
+    origin, away = rays_at(T, CAMERA)
+    z = (2.0 - origin[2]) / away[..., 2]
+    at = away * z[..., None] + origin
     light = pattern(at) * gain
     if hidden is not None:
         front = at[..., 0] > hidden
@@ -67,7 +67,7 @@ def look(T: np.ndarray, gain: float, *, hidden: float | None = None, lamp: bool 
     if not lamp:
         color = np.round(light).clip(1, 255).astype(np.uint8)
         return RangeFrame(0, 0.0, CAMERA, z.astype(np.float32), color_image=color)
-    square = (rays**2).sum(-1) * z * z
+    square = (away**2).sum(-1) * z * z
     amplitude = (light[..., 0] / square).astype(np.float32)
     return RangeFrame(0, 0.0, CAMERA, z.astype(np.float32), amplitude_image=amplitude)
 

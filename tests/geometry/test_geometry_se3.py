@@ -121,6 +121,14 @@ def test_orthonormalise_gives_nearest_rotation(xi: np.ndarray, noise: np.ndarray
     assert to_fixed <= np.linalg.norm(T[:3, :3] - bent[:3, :3]) + 1e-12
 
 
+@given(twists)
+def test_nearest_rotation_aligns_vectors(xi: np.ndarray) -> None:
+    """Also vectors of a plane, which a reflection would align as well."""
+    R = se3.exp(xi)[:3, :3]
+    p = np.random.default_rng(0).normal(size=(6, 3)) * [1, 0.5, 0]
+    np.testing.assert_allclose(se3.nearest_rotation(R @ p.T @ p), R, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     "change",
     [

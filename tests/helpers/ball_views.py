@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ray_casting import to_plane
 from tofuse.engine.cameras.cameras import BrownConrady
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry.rays import unit_rays
 
 EYE = np.eye(4)
 
@@ -27,9 +29,7 @@ def look(position, target, camera=CAMERA):
 
 def sphere_range(T, centre, radius, camera=CAMERA):
     """(H, W) range of rays to a sphere, infinite where they miss it."""
-    rays = camera.rays().astype(float)
-    d = np.concatenate([rays, np.ones_like(rays[..., :1])], -1)
-    d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ T[:3, :3].T
+    d = unit_rays(camera.rays()) @ T[:3, :3].T
     o = T[:3, 3] - centre
     b = d @ o
     under = b * b - (o @ o - radius**2)
@@ -39,12 +39,7 @@ def sphere_range(T, centre, radius, camera=CAMERA):
 
 def plane_range(T, normal, height, camera=CAMERA):
     """(H, W) range of rays to the plane normal . p = height."""
-    rays = camera.rays().astype(float)
-    d = np.concatenate([rays, np.ones_like(rays[..., :1])], -1)
-    d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ T[:3, :3].T
-    with np.errstate(divide="ignore"):
-        t = (height - T[:3, 3] @ normal) / (d @ normal)
-    return np.where(t > 0, t, np.inf)
+    return to_plane(T[:3, 3], unit_rays(camera.rays()) @ T[:3, :3].T, normal, height)
 
 
 def frame_of(ranges, index=0, sigma=0.005, noise=None, camera=CAMERA, **images):

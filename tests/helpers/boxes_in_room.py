@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ray_casting import rays_at, to_room
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 
@@ -20,16 +21,10 @@ BOXES = np.array(
 
 def views_in_room(camera: Pinhole, poses, noise_m: float, seed: int, boxes=BOXES):
     """Frames of z depth (m) at poses (N, 4, 4) T_world_camera, with Gaussian noise."""
-    rays = np.concatenate([camera.rays(), np.ones((camera.height, camera.width, 1))], -1)
     rng = np.random.default_rng(seed)
     frames = []
     for k, T in enumerate(np.asarray(poses)):
-        d, o = rays.astype(float) @ T[:3, :3].T, T[:3, 3]
-        z = ((np.where(d > 0, ROOM[1], ROOM[0]) - o) / d).min(-1)
-        for low, high in boxes:
-            a, b = (low - o) / d, (high - o) / d
-            near, far = np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
-            z = np.where((near < far) & (near > 0), np.minimum(z, near), z)
+        z, _ = to_room(*rays_at(T, camera), ROOM, boxes)
         z = z + rng.normal(0, noise_m, z.shape)
         frames.append(RangeFrame(k, k / 10, camera, z.astype(np.float32)))
     return frames

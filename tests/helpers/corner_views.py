@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ray_casting import rays_at, to_plane
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
@@ -23,22 +24,17 @@ def corner(
     T_world_camera: np.ndarray, *, offset: float = 0.0, waves: float = 1.0, camera: Pinhole = CAMERA
 ) -> RangeFrame:
     """A corner of three walls with a pattern, seen by a camera whose range is short by `offset`."""
-    rays = np.concatenate([camera.rays(), np.ones((48, 60, 1))], -1)
-    directions = rays @ T_world_camera[:3, :3].T
-    origin = T_world_camera[:3, 3]
+    origin, directions = rays_at(T_world_camera, camera)
     depth = np.full((48, 60), np.inf)
     light = np.zeros((48, 60))
     for normal, d in (((0, 0, 1), 3.0), ((0.8, 0, 0.6), 2.6), ((0, 0.8, 0.6), 2.4)):
-        n = np.array(normal)
-        z = (d - n @ origin) / (directions @ n)
-        z = np.where(z > 0, z, np.inf)
+        z = to_plane(origin, directions, normal, d)
         hit = origin + np.where(z < 20, z, 0)[..., None] * directions
         phase = waves * hit
         pattern = 1.5 + 0.5 * np.sin(7 * phase[..., 0]) * np.cos(phase[..., 1:] @ (6, 5))
         light = np.where(z < depth, pattern, light)
         depth = np.minimum(depth, z)
-    length = np.linalg.norm(rays, axis=-1)
-    depth = depth - offset / length
+    depth = depth - offset / np.linalg.norm(directions, axis=-1)
     return RangeFrame(
         index=0,
         timestamp=0.0,

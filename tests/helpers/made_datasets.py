@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ray_casting import rays_at, to_walls
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.geometry.se3 import exp
 from tofuse.formats.images.images import write_png
@@ -18,10 +19,7 @@ POSES = exp(np.random.default_rng(70).normal(size=(3, 6)) * [0.3, 0.3, 0.3, 0.4,
 
 def depths() -> np.ndarray:
     """(N, H, W) z in m of the box around the origin, seen from `POSES`."""
-    rays = np.concatenate([CAMERA.rays(), np.ones((CAMERA.height, CAMERA.width, 1))], -1)
-    directions = rays @ np.swapaxes(POSES[:, None, :3, :3], -1, -2)
-    centres = POSES[:, None, None, :3, 3]
-    return ((np.sign(directions) * SIDES - centres) / directions).min(-1)
+    return np.stack([to_walls(*rays_at(T, CAMERA), -SIDES, SIDES)[0] for T in POSES])
 
 
 def color(k: int) -> np.ndarray:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ray_casting import rays_at, to_box, to_walls
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
@@ -59,20 +60,16 @@ def seen(
 ) -> RangeFrame:
     """View of walls and boxes with spots of other albedo, whose places depend on `scene`."""
     rows, columns = camera.height, camera.width
-    rays = np.dstack([camera.rays(), np.ones((rows, columns))]).reshape(-1, 3)
-    origin, d = T_world_camera[:3, 3], rays @ T_world_camera[:3, :3].T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        walls = (np.sign(d) * half - origin) / d
-        z, across = walls.min(1), np.take_along_axis(d, walls.argmin(1)[:, None], 1)[:, 0]
-        for centre, size, turn in boxes:
-            R = se3.so3_exp([0, turn, 0])
-            o, e = (origin - np.array(centre)) @ R, d @ R
-            a, b = (-np.array(size) - o) / e, (np.array(size) - o) / e
-            first = np.minimum(a, b)
-            near, far = first.max(1), np.maximum(a, b).min(1)
-            hit = (near < far) & (near > 0) & (near < z)
-            side = np.take_along_axis(e, first.argmax(1)[:, None], 1)[:, 0]
-            z, across = np.where(hit, near, z), np.where(hit, side, across)
+    origin, d = rays_at(T_world_camera, camera)
+    d = d.reshape(-1, 3)
+    z, axis = to_walls(origin, d, -np.array(half), np.array(half))
+    across = np.take_along_axis(d, axis[:, None], 1)[:, 0]
+    for centre, size, turn in boxes:
+        R = se3.so3_exp([0, turn, 0])
+        e = d @ R
+        near, axis = to_box((origin - np.array(centre)) @ R, e, -np.array(size), np.array(size))
+        side = np.take_along_axis(e, axis[:, None], 1)[:, 0]
+        z, across = np.minimum(z, near), np.where(near < z, side, across)
     p = origin + z[:, None] * d
     rng = np.random.default_rng(scene)
     albedo = np.ones(len(p))

@@ -10,6 +10,7 @@ import numpy as np
 
 from made_phones import DEPTH, HEIGHT, WIDTH
 from tofuse.engine.cameras.cameras import Rational
+from tofuse.engine.geometry.rays import homogeneous
 
 
 def make_arducam(folder: Path) -> None:
@@ -47,7 +48,7 @@ def adi_frame(
     lens: Rational = ADI_LENS,
 ) -> bytes:
     """A frame as FrameHandler of Analog Devices' ToF SDK saves it, of a slanted wall."""
-    rays = np.concatenate([lens.rays(), np.ones((lens.height, lens.width, 1))], -1).astype(float)
+    rays = homogeneous(lens.rays())
     z = (1.8 + 0.1 * k) / (1 + 0.3 * rays[..., 0] + 0.1 * rays[..., 1])
     depth = np.rint(1000 * z * np.linalg.norm(rays, axis=-1))
     depth[2:5, 2:9] = 0

@@ -8,6 +8,7 @@ import numpy as np
 
 from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.sensor.multipath import ToFImage
 
 CAMERA = Pinhole(60, 48, 54.0, 54.0, 29.5, 23.5)
@@ -41,9 +42,8 @@ class Seen:
 
     def __init__(self, *planes: Plane, albedo: float = 0.6, camera: Pinhole = CAMERA) -> None:
         self.camera = camera
-        rays = camera.rays().astype(float)
         length = ray_lengths(camera).astype(float)
-        directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1) / length[..., None]
+        directions = homogeneous(camera.rays()) / length[..., None]
         normals = np.array([n for n, _ in planes])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         offsets = np.array([d for _, d in planes])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pose_errors import pose_error
+from ray_casting import rays_at
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.geometry import se3
@@ -95,11 +96,8 @@ CAMERA = Pinhole(width=120, height=90, fx=110, fy=110, cx=59.5, cy=44.5)
 
 def relief_image(T_world_camera, index=0, noise=0.0, seed=0, amplitude=None):
     """A range image of the relief, exact to the noise; amplitude(x, y) of the world, if given."""
-    rays = CAMERA.rays().astype(float)
-    rays = np.dstack([rays, np.ones(rays.shape[:2])])
-    d = rays @ T_world_camera[:3, :3].T
-    o = T_world_camera[:3, 3]
-    z = np.full(rays.shape[:2], 2.0)
+    o, d = rays_at(T_world_camera, CAMERA)
+    z = np.full(d.shape[:2], 2.0)
     for _ in range(60):
         p = o + z[..., None] * d
         z = z + 0.5 * (2 + relief_height(p[..., 0], p[..., 1]) - p[..., 2]) / d[..., 2]

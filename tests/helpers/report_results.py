@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ray_casting import rays_at, to_room
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
@@ -23,19 +24,6 @@ ROOM = np.array([[-3.4, -1.4, -1.5], [2.6, 1.1, 1.7]])
 BLOCKS = np.array([[[1.2, 0.3, 0.6], [1.9, 1.1, 1.2]], [[-2.6, -0.2, -1.0], [-2.0, 1.1, -0.4]]])
 
 
-def cast(origin, rays):
-    """Range along rays to the room's walls or a block in front of them, by the slab method."""
-    with np.errstate(divide="ignore"):
-        inverse = 1 / rays
-    near, far = ((bound - origin) * inverse for bound in ROOM)
-    best = np.maximum(near, far).min(-1)
-    for block in BLOCKS:
-        a, b = ((bound - origin) * inverse for bound in block)
-        enter, leave = np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
-        best = np.where((enter < leave) & (enter > 0), np.minimum(best, enter), best)
-    return best
-
-
 def circle(frames):
     """T_world_camera of a camera that turns once about an axis 0.15 m behind it."""
     angle = np.linspace(0, 2 * np.pi, frames, endpoint=False)
@@ -47,16 +35,13 @@ def circle(frames):
 
 
 def view(k, T, camera, rng):
-    flat = camera.rays().reshape(-1, 2).astype(float)
-    rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
-    world = rays @ T[:3, :3].T
-    z = cast(T[:3, 3], world)
-    hit = T[:3, 3] + world * z[:, None]
-    shape = (camera.height, camera.width)
-    texture = 0.6 + 0.3 * np.sign(np.sin(5 * hit).prod(1))
-    amplitude = (4000 * texture / (z**2 + 0.3)).astype(np.float32).reshape(shape)
-    depth = (z + rng.normal(0, 0.012, len(z))).astype(np.float32).reshape(shape)
-    depth[rng.random(shape) < 0.01] *= 0.8
+    origin, directions = rays_at(T, camera)
+    z, _ = to_room(origin, directions, ROOM, BLOCKS)
+    hit = origin + directions * z[..., None]
+    texture = 0.6 + 0.3 * np.sign(np.sin(5 * hit).prod(-1))
+    amplitude = (4000 * texture / (z**2 + 0.3)).astype(np.float32)
+    depth = (z + rng.normal(0, 0.012, z.shape)).astype(np.float32)
+    depth[rng.random(z.shape) < 0.01] *= 0.8
     return RangeFrame(k, k / 10, camera, depth, "z", amplitude)
 
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ray_casting import rays_at, to_plane
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 
@@ -22,20 +23,15 @@ BOARDS = (
 def looked_at(
     T_room_camera: np.ndarray, rng: np.random.Generator, offset: float, boards=BOARDS
 ) -> RangeFrame:
-    rays = np.concatenate([CAMERA.rays().astype(float), np.ones((72, 96, 1))], 2)
-    lengths = np.linalg.norm(rays, axis=2)
-    directions = rays @ T_room_camera[:3, :3].T
-    origin = T_room_camera[:3, 3]
+    origin, directions = rays_at(T_room_camera, CAMERA)
+    lengths = np.linalg.norm(directions, axis=2)
     z = np.full((72, 96), np.inf)
     for normal, d, half in boards:
         n = np.array(normal) / np.linalg.norm(normal)
-        facing = directions @ n
-        with np.errstate(divide="ignore"):
-            t = (d - origin @ n) / facing
-        hit = origin + t[..., None] * directions
-        near = (t > 0) & (np.abs(facing) > 1e-6)
-        near &= np.linalg.norm(hit - d * n, axis=2) < half
-        z = np.where(near & (t < z), t, z)
+        t = to_plane(origin, directions, n, d)
+        hit = origin + np.where(t < 99, t, 99)[..., None] * directions
+        near = np.linalg.norm(hit - d * n, axis=2) < half
+        z = np.where(near, np.minimum(t, z), z)
     noisy = z + (offset + rng.normal(0, 0.002, z.shape)) / lengths
     depth = np.where(np.isfinite(z) & (z < 5), noisy, 0).astype(np.float32)
     return RangeFrame(0, 0.0, CAMERA, depth, "z", None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ray_casting import rays_at, to_box, to_plane
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
@@ -21,26 +22,19 @@ FURNITURE = [
 
 def seen(T_world_camera, boxes=FURNITURE, sigma=0.004, seed=0, walls=True):
     """Depth of boxes, floor and two walls, with noise; a frame."""
-    rays = np.dstack([CAMERA.rays(), np.ones((120, 160))]).reshape(-1, 3)
-    origin, rays = T_world_camera[:3, 3], rays @ T_world_camera[:3, :3].T
-    best = np.full(len(rays), np.inf)
+    origin, rays = rays_at(T_world_camera, CAMERA)
+    best = np.full((120, 160), np.inf)
     planes = [((0, 1, 0), 1.0)]
     planes += [((0.1, 0, 1), 3.8), ((1, 0, -0.2), 1.7)] if walls else []
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for normal, distance in planes:
-            along = (distance - origin @ normal) / (rays @ normal)
-            best = np.where((along > 0) & (along < best), along, best)
-        for centre, half, turn in boxes:
-            R = se3.so3_exp([0, turn, 0])
-            o, d = (origin - centre) @ R, rays @ R
-            a, b = (-np.array(half) - o) / d, (np.array(half) - o) / d
-            near, far = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
-            hit = (near < far) & (near > 0)
-            best = np.where(hit & (near < best), near, best)
+    for normal, distance in planes:
+        best = np.minimum(best, to_plane(origin, rays, normal, distance))
+    for centre, half, turn in boxes:
+        R, half = se3.so3_exp([0, turn, 0]), np.array(half)
+        best = np.minimum(best, to_box((origin - centre) @ R, rays @ R, -half, half)[0])
     rng = np.random.default_rng([7, seed])
-    depth = best + sigma * rng.standard_normal(len(best))
+    depth = best + sigma * rng.standard_normal(best.shape)
     depth[~(best < 8)] = 0
-    return RangeFrame(seed, float(seed), CAMERA, depth.reshape(120, 160).astype(np.float32), "z")
+    return RangeFrame(seed, float(seed), CAMERA, depth.astype(np.float32), "z")
 
 
 def camera(x, z, yaw, pitch=-0.35):

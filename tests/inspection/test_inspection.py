@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import tofuse
+from ray_casting import rays_at, to_room, to_walls
 from tofuse.apps.cli.program import main
 from tofuse.apps.inspection.channels import check_mirrored
 from tofuse.apps.inspection.finding import CODES, Finding
@@ -146,19 +147,11 @@ ROOM = BrownConrady(96, 72, 70.0, 70.0, 47.0, 36.0, k1=-0.2, k2=0.05)
 
 def room_depth(camera, T: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """z and light of a room of 5 x 2.6 x 4 m with two boxes, from a camera at T_room_camera."""
-    rays = camera.rays().astype(float)
-    d = np.concatenate([rays, np.ones_like(rays[..., :1])], -1) @ T[:3, :3].T
-    o = T[:3, 3]
-    low, high = np.array([-2.5, -1.3, -2.0]), np.array([2.5, 1.3, 2.0])
-    with np.errstate(all="ignore"):
-        wall = np.where(d > 0, (high - o) / d, (low - o) / d)
-    axis, z = wall.argmin(-1), wall.min(-1)
-    for a, b in (([-0.6, 0.2, 1.0], [0.1, 1.3, 1.5]), ([1.2, -0.2, -0.6], [1.7, 1.3, 0.1])):
-        with np.errstate(all="ignore"):
-            t = np.stack([(np.array(a) - o) / d, (np.array(b) - o) / d])
-        near, far = t.min(0).max(-1), t.max(0).min(-1)
-        hit = (near < far) & (near > 0) & (near < z)
-        axis, z = np.where(hit, 3 + t.min(0).argmax(-1), axis), np.where(hit, near, z)
+    o, d = rays_at(T, camera)
+    walls = np.array([[-2.5, -1.3, -2.0], [2.5, 1.3, 2.0]])
+    boxes = [[-0.6, 0.2, 1.0], [0.1, 1.3, 1.5]], [[1.2, -0.2, -0.6], [1.7, 1.3, 0.1]]
+    z, axis = to_room(o, d, walls, boxes)
+    axis = axis + 3 * (z < to_walls(o, d, *walls)[0])  # boxes are lighter
     p = o + d * z[..., None]
     waves = np.sin(7 * p[..., 0]) + np.sin(6 * p[..., 1]) + np.sin(5 * p[..., 2] + 1)
     light = (1 + 0.15 * waves) * (0.6 + 0.1 * axis) * 4000 / z**2

@@ -10,10 +10,12 @@ import pytest
 import tofuse
 from tofuse.apps.inspection.pose_convention import misread_poses
 from tofuse.apps.inspection.sample import Sample
+from tofuse.apps.jobs.pose_scale import with_scale
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import quaternion, se3
+from tofuse.engine.geometry.rays import unit_rays
 from tofuse.lab.simulation.record import plan
 
 GL = np.diag([1.0, -1, -1, 1])
@@ -24,12 +26,6 @@ def rolled(T, shift):
     q = np.roll(quaternion.from_matrix(T[:, :3, :3]), shift, -1)
     out = T.copy()
     out[:, :3, :3] = quaternion.to_matrix(q)
-    return out
-
-
-def scaled(T, factor):
-    out = T.copy()
-    out[:, :3, 3] *= factor
     return out
 
 
@@ -47,11 +43,11 @@ MISREAD = {
     "turned by 90 degrees": lambda T: turned(T, -1),
     "turned by 180 degrees": lambda T: turned(T, -2),
     "turned by 270 degrees": lambda T: turned(T, -3),
-    "in mm": lambda T: scaled(T, 1000),
-    "in cm": lambda T: scaled(T, 100),
-    "in feet": lambda T: scaled(T, 3.281),
-    "2.5 times as far apart": lambda T: scaled(T, 2.5),
-    "0.4 times as far apart": lambda T: scaled(T, 0.4),
+    "in mm": lambda T: with_scale(T, 1000),
+    "in cm": lambda T: with_scale(T, 100),
+    "in feet": lambda T: with_scale(T, 3.281),
+    "2.5 times as far apart": lambda T: with_scale(T, 2.5),
+    "0.4 times as far apart": lambda T: with_scale(T, 0.4),
 }
 SCALES = ("in feet", "2.5 times as far apart", "0.4 times as far apart")
 
@@ -61,14 +57,12 @@ def recording():
     """A room seen on a way with turns about all axes."""
     made = plan("room")
     camera = Pinhole(80, 60, 70.0, 70.0, 39.5, 29.5)
-    rays = np.insert(camera.rays().reshape(-1, 2).astype(float), 2, 1, -1)
+    rays = unit_rays(camera.rays().reshape(-1, 2))
     rng = np.random.default_rng(4)
     T = made.sequence.T_room_camera(made.raw[0] / made.sequence.frame_rate_hz)
     frames, poses = [], []
     for k in range(9):
-        hits = made.scene.cast(
-            T[:3, 3], (rays / np.linalg.norm(rays, axis=1)[:, None]) @ T[:3, :3].T
-        )
+        hits = made.scene.cast(T[:3, 3], rays @ T[:3, :3].T)
         z = hits.distance.reshape(60, 80) / np.sqrt((camera.rays() ** 2).sum(-1) + 1)
         z = np.where(np.isfinite(z), z + rng.normal(0, 0.003, z.shape), 0).astype(np.float32)
         frames.append(RangeFrame(k, k / 10, camera, z, "z"))

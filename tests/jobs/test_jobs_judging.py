@@ -12,6 +12,7 @@ import pytest
 import tofuse
 from tofuse.apps.cli.program import main
 from tofuse.apps.jobs.judging import poses_for, sentence
+from tofuse.apps.jobs.pose_scale import with_scale
 from tofuse.apps.results.folders import RESULT
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
@@ -87,15 +88,9 @@ def on_rail(tmp_path_factory):
     return tofuse.open(folder)
 
 
-def scaled(poses, factor):
-    out = poses.copy()
-    out[:, :3, 3] *= factor
-    return out
-
-
 @pytest.mark.parametrize("factor", [1.0, 0.2, pytest.param(5.0, marks=pytest.mark.nightly_part)])
 def test_poses_of_another_scale_are_judged_in_metres(factor, on_rail):
-    found = tofuse.judge(on_rail, scaled(on_rail.reference, factor))
+    found = tofuse.judge(on_rail, with_scale(on_rail.reference, factor))
     scale = found.scale
     assert scale.applied == (factor != 1)
     assert abs(scale.factor * factor - 1) < 3 * scale.sigma * factor
@@ -111,7 +106,7 @@ def test_poses_of_another_scale_are_judged_in_metres(factor, on_rail):
 
 @pytest.mark.nightly_part
 def test_small_error_of_scale_is_an_error_unless_scale_is_unknown(on_rail):
-    poses = scaled(on_rail.reference, 1.08)
+    poses = with_scale(on_rail.reference, 1.08)
     assert not tofuse.judge(on_rail, poses).scale.applied
     found = tofuse.judge(on_rail, poses, scale=True)
     assert found.scale.applied

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from tofuse.engine.geometry import triangles
 from tofuse.lab.experiments import measures
-from tofuse.lab.experiments.recorded import sample_surface
 
 
 def box_points(rng, widths, turn_deg=0.0, shift=(0.0, 0.0)) -> np.ndarray:
@@ -56,7 +56,7 @@ def test_path_score_localizes_errors():
 
 def test_surface_error_is_distance_to_model():
     square = np.array([[[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 0, 0], [1, 1, 0], [0, 1, 0]]], float)
-    surface = sample_surface(square, 60_000)
+    surface = triangles.random_points(square, 60_000, np.random.default_rng(1))
     assert (np.histogram2d(*surface[:, :2].T, bins=4)[0] > 60_000 / 16 * 0.9).all()
     above = np.random.default_rng(3).uniform(0, 1, (5000, 3)) * [1, 1, 0] + [0, 0, 0.05]
     assert measures.surface_error_m(above, cKDTree(surface)) == pytest.approx(0.05, abs=1e-3)

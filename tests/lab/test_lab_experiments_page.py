@@ -11,7 +11,7 @@ import pytest
 
 from tofuse.lab.experiments.page import run_experiments
 from tofuse.lab.experiments.peaks import PeaksSweep
-from tofuse.lab.experiments.statements import STATEMENTS, Results
+from tofuse.lab.experiments.statements import STATEMENTS
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def test_sweep_is_judged_by_its_errors():
     chosen = {s.name: s for s in STATEMENTS}
 
     def outcome(name, sweep):
-        return chosen[name].judge(Results({}, sweep), "thesis").outcome
+        return chosen[name].judge(sweep).outcome
 
     for name in ("threshold", "improves", "y", "x-z", "more-noise", "yaw"):
         assert outcome(f"peaks-{name}", sweep) == "agrees"

@@ -9,6 +9,7 @@ import pytest
 
 import tofuse
 from pose_errors import pose_error
+from ray_casting import rays_at, to_plane
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.clouds.robust_motion import ConsensusOptions, Pairs, motions_of
 from tofuse.engine.clouds.robust_motion import consensus as consensus_of
@@ -28,15 +29,15 @@ METHODS = ("samples", "compatible")
 
 def poster(T_world_camera, *, seed=0, noise=0.004, plain=False):
     """A corner of two walls and a floor with round spots of any brightness, and noise."""
-    rays = np.dstack([CAMERA.rays(), np.ones((132, 176))]).reshape(-1, 3)
-    d, o = rays @ T_world_camera[:3, :3].T, T_world_camera[:3, 3]
+    o, d = rays_at(T_world_camera, CAMERA)
+    d = d.reshape(-1, 3)
     depth, light = np.full(len(d), 9.0), np.ones(len(d))
     walls = [((0.5, 0, 0.866), 2.6), ((-0.6, 0, 0.8), 2.8), ((0, 0.9, 0.436), 1.9)]
     for k, (normal, distance) in enumerate(walls):
         n = np.array(normal)
-        z = (distance - o @ n) / (d @ n)
-        hit = (z > 0) & (z < depth)
-        p = (o + z[:, None] * d)[hit]
+        z = to_plane(o, d, n, distance)
+        hit = z < depth
+        p = o + z[hit, None] * d[hit]
         u = np.cross(n, [0.3, 0.9, 0.1])
         u /= np.linalg.norm(u)
         spots = np.random.default_rng([5, k])
@@ -47,9 +48,10 @@ def poster(T_world_camera, *, seed=0, noise=0.004, plain=False):
         depth[hit] = z[hit]
         light[hit] = np.where(inside.any(1), level[np.argmax(inside, 1)], 1.0)
     rng = np.random.default_rng([6, seed])
-    depth = depth * (1 + noise * rng.standard_normal(len(depth)) / np.linalg.norm(rays, axis=1))
+    length = np.linalg.norm(d, axis=1)
+    depth = depth * (1 + noise * rng.standard_normal(len(depth)) / length)
     light = light * (1 + 0.02 * rng.standard_normal(len(depth)))
-    r2 = (depth * np.linalg.norm(rays, axis=1)) ** 2
+    r2 = (depth * length) ** 2
     amplitude = 4000 * (np.ones_like(light) if plain else light) / r2
     depth, amplitude = (x.reshape(132, 176).astype(np.float32) for x in (depth, amplitude))
     return RangeFrame(seed, float(seed), CAMERA, depth, "z", amplitude_image=amplitude)

@@ -1,4 +1,4 @@
-"""Kernels of the laboratory that search and sum over points, against slow twins."""
+"""Searches and sums over points of the laboratory, against slow twins."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.lab.methods.featured_tree import FeaturedKdTree
-from tofuse.lab.methods.symmetric_kernels import symmetric_sums
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -27,16 +26,6 @@ def test_moments_match_twin_and_are_rotation_invariant():
     T = se3.exp([1, 2, 3, 0.5, -1, 0.3])
     turned = FeaturedKdTree(se3.transform(T, points)).moments(se3.transform(T, centres), 0.7)
     np.testing.assert_allclose(turned, found, atol=1e-9)
-
-
-def test_symmetric_sums_match_twin():
-    r = np.random.default_rng(7)
-    p, q, n, w = (*r.normal(size=(3, 20, 3)), r.uniform(0, 2, 20))
-    J = np.hstack([n, np.cross(p + q, n)])
-    e = ((p - q) * n).sum(1)
-    H, g = symmetric_sums(p, q, n, w)
-    np.testing.assert_allclose(H, J.T @ (w[:, None] * J), atol=1e-12)
-    np.testing.assert_allclose(g, J.T @ (w * e), atol=1e-12)
 
 
 @settings(max_examples=40)

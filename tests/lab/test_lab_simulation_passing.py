@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tofuse.engine.geometry.rays import unit_rays
 from tofuse.formats.images.images import read_image
 from tofuse.lab.simulation.effects import Effects, Flag
 from tofuse.lab.simulation.passing import Passing
@@ -14,9 +15,7 @@ from tofuse.lab.simulation.record import plan, simulate, simulate_recording
 def covered(made, step=3):
     """Fraction of the image that the passing object covers in each frame (N,)."""
     ids = list(made.scene.passing_surfaces)
-    xy = made.model.camera.rays()[::step, ::step].reshape(-1, 2).astype(float)
-    rays = np.column_stack([xy, np.ones(len(xy))])
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    rays = unit_rays(made.model.camera.rays()[::step, ::step].reshape(-1, 2))
     out = []
     for raw in made.raw:
         t = raw / made.sequence.frame_rate_hz

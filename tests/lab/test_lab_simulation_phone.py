@@ -12,6 +12,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import scaled
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.formats.poses import read_tum
 from tofuse.formats.recordings import open_recording
@@ -49,9 +50,8 @@ def test_app_folder_is_read_with_colour_and_the_phones_poses(tmp_path: Path) -> 
 def colors_at(planned: phone.PhonePlan, a: int, b: int) -> tuple[Float64, Float64]:
     """Return the colours of points of frame `a` in its own image, and in that of frame `b`."""
     frames = list(planned.frames())
-    rays = phone.DEPTH.rays().astype(float)
     z = frames[a].depth / 1000.0
-    points = (np.concatenate([rays, np.ones((*rays.shape[:2], 1))], 2) * z[..., None])[::4, ::4]
+    points = (homogeneous(phone.DEPTH.rays()) * z[..., None])[::4, ::4]
     points = points[z[::4, ::4] > 0]
     T_b_a = se3.inverse(planned.poses[b]) @ planned.poses[a]
     out, seen = [], np.ones(len(points), bool)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.formats.geometry.ply import read_ply
 from tofuse.formats.images.images import read_image
 from tofuse.formats.poses.trajectory import read_tum
@@ -64,10 +65,10 @@ def test_true_depth_lies_on_true_surface(folder) -> None:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     source = NativeSource(folder)
-    rays = source.camera.rays()[::9, ::9].reshape(-1, 2).astype(float)
+    rays = homogeneous(source.camera.rays()[::9, ::9].reshape(-1, 2))
     for k in range(3):
         z = read_image(folder / "truth" / "depth" / f"{k:06d}.png")[::9, ::9].ravel() * 1e-4
-        points = np.column_stack([rays, np.ones(len(rays))]) * z[:, None]
+        points = rays * z[:, None]
         points = se3.transform(source.reference[k], points[z > 0])
         off = np.abs(np.einsum("nfc,fc->nf", points[:, None] - corners[:, 0], normals)).min(1)
         assert len(points) > 200

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import tofuse
+from ray_casting import rays_at, to_plane
 from report_results import lonely
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
@@ -149,15 +150,12 @@ def past_a_corner(covered: Collection[int] = ()) -> Recording:
     along = 1.6 * a - 1.3 + 0.2 * np.sin(10 * a)
     twists = [along, 0.05 * np.sin(9 * a), 0.1 * np.sin(5 * a), 0.05 * np.sin(7 * a)]
     poses = se3.exp(np.stack([*twists, 0.05 * np.sin(6 * a), 0.05 * np.sin(11 * a)], 1))
-    rays = np.concatenate([CAMERA.rays(), np.ones((120, 160, 1))], -1)
     rng = np.random.default_rng(0)
     frames = []
     for k, T in enumerate(poses):
-        directions, p = rays @ T[:3, :3].T, T[:3, 3]
-        depth = np.full((120, 160), np.inf)
-        for axis, at in ((0, -1.6), (1, 0.6), (2, 2.0)):
-            z = (at - p[axis]) / directions[..., axis]
-            depth = np.minimum(depth, np.where(z > 0, z, np.inf))
+        rays = rays_at(T, CAMERA)
+        planes = zip(np.eye(3), (-1.6, 0.6, 2.0), strict=True)
+        depth = np.min([to_plane(*rays, normal, at) for normal, at in planes], 0)
         noise = rng.normal(0, 0.002, depth.shape)
         image = np.where(k in covered, 0.0, depth + noise).astype(np.float32)
         frames.append(RangeFrame(k, k / 30, CAMERA, image))

@@ -14,6 +14,7 @@ from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.mapping.config import changed
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
@@ -53,7 +54,7 @@ def test_corrected_points_are_correct(camera, kind, distortion) -> None:
     scale = 1.1 + distortion * (slopes[0] ** 2).sum(1, keepdims=True)
     true = scale * slopes[0] + [0.02, -0.03]
     np.testing.assert_allclose(slopes[1], true, rtol=1e-5, atol=1e-6)
-    rays = np.concatenate([true, np.ones((len(true), 1))], axis=1)
+    rays = homogeneous(true)
     lengths = np.linalg.norm(rays, axis=1)
     # The camera measures 2 m: the range, or z along the corrected ray.
     ranges = (2.0 if kind == "range" else 2.0 * lengths) + 0.05

@@ -14,6 +14,7 @@ from paths import DOCS
 from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.noise.model import (
     NOISE,
     AmplitudeLaw,
@@ -122,7 +123,7 @@ def test_z_images_have_noise_of_their_range() -> None:
 def test_tilted_wall_is_noisier_by_change_within_pixel() -> None:
     # z = d / (n . ray) for a plane at 60 degrees: the exact change to the next pixel.
     normal = np.array([np.sin(np.pi / 3), 0.0, -np.cos(np.pi / 3)])
-    rays = np.dstack([CAMERA.rays(), np.ones((30, 40))])
+    rays = homogeneous(CAMERA.rays())
     z = (-2.0 / (rays @ normal)).astype(np.float32)
     z[z < 0] = 0
     normals = np.broadcast_to(normal.astype(np.float32), (30, 40, 3))

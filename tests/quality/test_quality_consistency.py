@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ray_casting import rays_at, to_walls
 from tofuse.apps.jobs.evaluating import evaluate
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
@@ -34,13 +35,7 @@ from written_run_json import write_run
 # A synthetic room, and poses in it -------------------------------------------------------------
 
 
-def room_range(rays: Float64, T: Float64) -> Float64:
-    """z depth (H, W) of a box 4 x 3 x 5 m round the origin, seen from inside."""
-    half = np.array([2.0, 1.5, 2.5])
-    d = np.concatenate([rays, np.ones((*rays.shape[:-1], 1))], -1) @ T[:3, :3].T
-    with np.errstate(all="ignore"):
-        walls = (np.sign(d) * half - T[:3, 3]) / d
-    return np.nanmin(walls, axis=-1)
+HALF = np.array([2.0, 1.5, 2.5])  # of the edges of the room, round the origin
 
 
 def path(n: int) -> Float64:
@@ -55,9 +50,8 @@ def path(n: int) -> Float64:
 def look(camera: Camera, poses: Float64, noise: float = 0.004) -> list[RangeFrame]:
     rng = np.random.default_rng(0)
     frames = []
-    rays = camera.rays().astype(float)
     for k, T in enumerate(poses):
-        z = room_range(rays, T)
+        z, _ = to_walls(*rays_at(T, camera), -HALF, HALF)
         z = np.nan_to_num(z + noise * rng.standard_normal(z.shape))
         z[rng.random(z.shape) < 0.05] = 0
         z = np.rint(z / 0.0005) * 0.0005

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from tests.helpers.measured_graph import DEPTH_M, RIGID, jumped, measured
 
+from tofuse.apps.jobs.pose_scale import with_scale
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.pose_causes import cause_of
 from tofuse.engine.quality.pose_deviation import deviation, fitted
@@ -37,14 +38,8 @@ def drifted(poses, per_step):
     return np.array(out)
 
 
-def scaled(poses, factor):
-    out = poses.copy()
-    out[:, :3, 3] *= factor
-    return out
-
-
 WRONG = {
-    "scale": lambda T: scaled(T, 1.1),
+    "scale": lambda T: with_scale(T, 1.1),
     "time": lambda T: T @ se3.exp(-0.05 * velocity(T)),
     "mount": lambda T: T @ se3.exp(np.array([0.06, 0, 0.09, 0, 0.06, 0])),
     "turning": lambda T: drifted(T, [0, 0, 0, 0.02, 0.08, 0]),

@@ -12,6 +12,7 @@ import pytest
 import made_kinect as made
 from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.errors import InputError
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.formats.cameras.camera_file import ColorCamera
 from tofuse.formats.recordings.open import open_recording
 
@@ -49,7 +50,7 @@ def test_rays_match_opencv_in_every_mode(tmp_path: Path, mode: str) -> None:
     seen = np.isfinite(rays).all(-1)
     pixels = np.stack([u, v], -1)[seen].astype(float)
     # Both ways: our rays project to the pixels, and OpenCV's rays of the pixels equal ours.
-    points = np.concatenate([rays[seen], np.ones((len(pixels), 1))], 1)
+    points = homogeneous(rays[seen])
     landed = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, distortion)[0][:, 0]
     assert np.abs(landed - pixels).max() < 1e-3
     stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-10)

@@ -30,6 +30,7 @@ from ros_bags import (
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, Rational
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.geometry.se3 import exp, inverse, log
 from tofuse.formats.images.images import png_bytes
 from tofuse.formats.readers.maker_bags import RealSenseSource
@@ -294,8 +295,9 @@ def test_realsense_color_with_inverse_distortion(tmp_path: Path) -> None:
     stated = BrownConrady(48, 40, 40.0, 41.0, 23.0, 20.0, k[0], k[1], k[2], k[3], k[4])
     slopes = np.stack([(COLOR_U - 23.0) / 40, (COLOR_V - 20.0) / 41, 0.0 * COLOR_U + 1], -1)
     rays = (stated.project(slopes) - (23.0, 20.0)) / (40.0, 41.0)
-    points = np.concatenate([rays, np.ones((40, 48, 1))], -1)
-    np.testing.assert_allclose(lens.project(points), np.stack([COLOR_U, COLOR_V], -1), atol=0.1)
+    np.testing.assert_allclose(
+        lens.project(homogeneous(rays)), np.stack([COLOR_U, COLOR_V], -1), atol=0.1
+    )
 
 
 @pytest.mark.parametrize(("encoding", "off"), [("jpeg", 14), ("rgb8", 0)])

@@ -10,6 +10,7 @@ import pytest
 import tofuse
 from made_rooms import BOXES, CAMERA, OTHER, at, seen, surface
 from pose_errors import pose_error
+from ray_casting import rays_at, to_plane
 from tofuse.engine.alignment.base import PROBABLE
 from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
 from tofuse.engine.cameras.cameras import RayTable
@@ -119,8 +120,7 @@ def test_views_of_different_rooms_are_rejected(pair):
 
 def wall(T_world_camera, index, noise=0.004):
     """A flat wall of one albedo, 2 m ahead."""
-    rays = np.dstack([CAMERA.rays(), np.ones((CAMERA.height, CAMERA.width))])
-    z = (2 - T_world_camera[2, 3]) / (rays @ T_world_camera[2, :3])
+    z = to_plane(*rays_at(T_world_camera, CAMERA), np.array([0, 0, 1]), 2)
     z += np.random.default_rng(index).normal(0, noise, z.shape)
     return RangeFrame(index, 0.0, CAMERA, z.astype(np.float32))
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from ray_casting import rays_at, to_box
 from tofuse.engine.alignment.projective import ProjectiveOptions, Target, align
 from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
 from tofuse.engine.frames.frames import RangeFrame
@@ -60,14 +61,10 @@ def room():
 def with_box(frame, centre, half, noise, seed):
     """Add a box with flying pixels at its edges to a frame; return the frame and the mask."""
     rng = np.random.default_rng(seed)
-    rays = frame.camera.rays().astype(float)
-    d = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1)
-    with np.errstate(divide="ignore"):
-        a, b = (centre - half) / d, (centre + half) / d
-    near, far = np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
-    scene = np.where(frame.valid, frame.z, np.inf)
-    mask = (near < far) & (near > 0.1) & (near < scene)
-    r2 = np.where(mask, near, 1) ** 2 * (1 + (rays**2).sum(-1))
+    origin, d = rays_at(np.eye(4), frame.camera)
+    near, _ = to_box(origin, d, centre - half, centre + half)
+    mask = near < np.where(frame.valid, frame.z, np.inf)
+    r2 = np.where(mask, near, 1) ** 2 * (d**2).sum(-1)
     amplitude = frame.amplitude_image.copy()
     amplitude[mask] = 0.6 * np.median(amplitude[frame.valid])
     noisy = near + rng.normal(0, 1, near.shape) * noise * r2 / np.maximum(amplitude, 1)

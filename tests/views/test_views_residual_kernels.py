@@ -9,6 +9,7 @@ from tofuse.engine.alignment import step_kernels as steps
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
 from tofuse.engine.geometry import rigid_motion_kernels as rigid_motions
 from tofuse.engine.geometry import se3
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.views import residual_kernels as kernels
 from tofuse.engine.views.projection import Projection
 
@@ -153,7 +154,7 @@ def test_points_project_onto_their_pixels(camera, step):
     w = 1 / (1 + np.arange(rows * columns, dtype=np.float32).reshape(rows, columns) / 100)
     planes = np.zeros((rows, columns, 4), np.float32)
     planes[..., 2] = planes[..., 3] = w
-    points = np.concatenate([rays, np.ones((rows, columns, 1))], -1) / w[..., None]
+    points = homogeneous(rays) / w[..., None]
     n = rows * columns
     ahead = np.tile(np.float32([0, 0, 1]), (n, 1))
     view = (points.reshape(n, 3).astype(np.float32), ahead,

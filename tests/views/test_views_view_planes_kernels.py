@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
+from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.views.view_planes_kernels import (
     albedo_image,
     fit_planes,
@@ -173,7 +174,7 @@ def test_pixel_off_its_neighbours_plane_has_no_plane():
 def test_lambertian_plane_has_uniform_albedo(power, camera, falloff):
     rays = camera.rays().astype(float)
     w = plane_w(rays).astype(float)
-    direction = np.concatenate([rays, np.ones((*w.shape, 1))], -1)
+    direction = homogeneous(rays)
     length = np.linalg.norm(direction, axis=-1)
     cosine = (direction @ [A, B, C]) / length / np.linalg.norm([A, B, C])
     distance = length / w

@@ -12,7 +12,7 @@ from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.cameras import Camera, depth_conversion, ray_lengths
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, Recording
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import homogeneous, se3
 from tofuse.engine.noise import NoiseModel, noise_model_for
 from tofuse.engine.search import detect_planes
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
@@ -180,8 +180,8 @@ def _plane_views(
     sigma = noise.sigma(frame).astype(float)
     rays = frame.camera.rays().astype(float)
     pixels = np.flatnonzero(mask & (sigma > 0) & np.isfinite(rays).all(-1))
-    homogeneous = np.concatenate([rays.reshape(-1, 2)[pixels], np.ones((len(pixels), 1))], 1)
-    directions = homogeneous / ray_lengths(frame.camera).ravel()[pixels, None]
+    directions = homogeneous(rays.reshape(-1, 2)[pixels])
+    directions /= ray_lengths(frame.camera).ravel()[pixels, None]
     frontal = directions @ plane > _MIN_COSINE * np.linalg.norm(plane)
     pixels, directions = pixels[frontal], directions[frontal]
     if len(pixels) < _MIN_PIXELS:

@@ -129,7 +129,7 @@ class Reference:
                 surface, points, surface.normals, area, region, none, size, False, surface.sigma
             )._sorted()
         corners = surface.points[surface.faces]
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        cross = triangle_geometry.crosses(corners)
         area = 0.5 * np.linalg.norm(cross, axis=1)
         if not area.sum() > 0:
             raise InputError("has faces without area", where=surface.name)
@@ -290,7 +290,6 @@ def measured_points(surface: Surface, reference: Reference) -> Surface:
         return surface
     corners = surface.points[surface.faces]
     triangles, source = _divided(corners, reference.size)
-    a, b, c = np.moveaxis(corners[source], 1, 0)
-    normals = unit_vectors(np.cross(b - a, c - a))
+    normals = unit_vectors(triangle_geometry.crosses(corners[source]))
     sigma = None if surface.sigma is None else surface.sigma[surface.faces].mean(1)[source]
     return replace(surface, points=triangles.mean(1), normals=normals, faces=None, sigma=sigma)

@@ -14,7 +14,7 @@ from tofuse.engine.arrays import Float64, Int32
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame
 from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh
-from tofuse.engine.geometry import KdTree
+from tofuse.engine.geometry import KdTree, triangles
 from tofuse.engine.icp import extent, surface_shape
 from tofuse.engine.normal import OF_95_PERCENT
 from tofuse.engine.results import Reconstruction
@@ -166,8 +166,7 @@ def _of_record(record: GeometryRecord, name: str) -> Surface:
 
 def vertex_normals(points: Float64, faces: Int32) -> Float64:
     """Return the normals (N, 3) of vertices, weighted by the area of their faces."""
-    a, b, c = np.moveaxis(points[faces], 1, 0)
-    area = np.cross(b - a, c - a)
+    area = triangles.crosses(points[faces])
     normals = np.stack(
         [
             np.bincount(faces.ravel(), np.repeat(area[:, k], 3), minlength=len(points))

@@ -25,8 +25,6 @@ from tofuse.formats.recordings import open_recording, read_reference
 
 Poses = str | Path | Float64 | Reconstruction
 
-_TRAJECTORY = "trajectory.txt"  # of a result
-
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
@@ -158,7 +156,7 @@ class _Result:
 
 def _result_of(poses: Poses) -> _Result | None:
     """Return the result that poses are read from, whose files fit each other; None without one."""
-    folder = _result_folder(poses)
+    folder = None if not isinstance(poses, str | Path) else folders.result_of_poses(Path(poses))
     if folder is None:
         return None
     with run_json.opened(folder) as run:
@@ -178,17 +176,6 @@ def _correctors(
         return ()
     with reading.damage_reported(result.folder / "run.json", "a run.json"):
         return CameraErrors.made_with(result.run["config"])
-
-
-def _result_folder(poses: Poses) -> Path | None:
-    """Return the result that poses are read from; None if there is none."""
-    if not isinstance(poses, str | Path):
-        return None
-    path = Path(poses)
-    if path.name == _TRAJECTORY:
-        return path.parent if folders.is_result(path.parent) else None
-    # Nothing else that is read has a run.json, so that a damaged one is reported.
-    return path if (path / "run.json").is_file() else None
 
 
 def _poses(source: Poses, name: str, *, is_reference: bool = False) -> TimedPoses:

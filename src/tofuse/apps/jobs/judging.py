@@ -659,9 +659,8 @@ def _stated_accuracy(
         return trajectory.diagnostics.accuracy
     if not isinstance(trajectory, str | Path):
         return None
-    path = Path(trajectory)
-    folder = path.parent if path.name == "trajectory.txt" else path
-    if not (folder / "run.json").is_file():
+    folder = folders.result_of_poses(Path(trajectory))
+    if folder is None:
         return None
     try:
         return stated_accuracy(folder)

@@ -13,7 +13,7 @@ from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.filters import apply_filters
 from tofuse.engine.frames import CloudFrame, Frame, Recording
 from tofuse.engine.fusion import Textured
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, triangles
 from tofuse.engine.mapping import Config, changed, reconstructing
 from tofuse.engine.parts import name_of
 from tofuse.engine.results import Reconstruction
@@ -130,17 +130,5 @@ def truth_points(recording: Recording) -> Float32 | None:
     if truth.faces is None or len(truth.faces) == 0:
         return truth.points.astype(np.float32)
     corners = truth.points[truth.faces].astype(float)
-    area = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
-    rng = np.random.default_rng(0)
-    triangles = corners[rng.choice(len(corners), _TRUTH_POINTS, p=area / area.sum())]
-    u, v = rng.random((2, _TRUTH_POINTS, 1))
-    flip = u + v > 1
-    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
-    points = (
-        triangles[:, 0]
-        + u * (triangles[:, 1] - triangles[:, 0])
-        + v * (triangles[:, 2] - triangles[:, 0])
-    )
+    points = triangles.random_points(corners, _TRUTH_POINTS, np.random.default_rng(0))
     return points.astype(np.float32)

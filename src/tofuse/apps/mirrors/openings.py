@@ -10,6 +10,7 @@ import numpy as np
 
 from tofuse.apps.mirrors.views import Noise, View
 from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.geometry import unit_rays
 
 # Planes: number of hypotheses and of points that vote, fewest of them on a plane, and the
 # smallest cosine between its normal and those of its points.
@@ -166,9 +167,7 @@ def find_openings(plane: Plane, views: Sequence[View], noise: Noise) -> list[Ope
             continue
         step = max(1, int(np.sqrt(view.ranges.size / _RAYS)))
         measured = view.ranges[::step, ::step].ravel()
-        xy = view.camera.rays()[::step, ::step].reshape(-1, 2).astype(float)
-        rays = np.c_[xy, np.ones(len(xy))]
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        rays = unit_rays(view.camera.rays()[::step, ::step].reshape(-1, 2))
         rays = rays @ view.T_world_camera[:3, :3].T
         reached = plane.crossings(view.origin, rays)
         depth = (measured - reached) * np.abs(rays @ plane.normal)

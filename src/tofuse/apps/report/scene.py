@@ -14,7 +14,7 @@ from tofuse.apps.report.packing import normal_bytes, pack, quantized
 from tofuse.apps.results import QUALITY, viridis
 from tofuse.engine.arrays import Float32, Float64, Int32, Intp, UInt8, UInt16
 from tofuse.engine.fusion import Cloud, Mesh, Textured, drawing
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, triangles
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.images import jpeg_bytes
 
@@ -332,7 +332,7 @@ def _drawn_surface(
     light = 0.6 + 0.4 * np.abs(_cosines(vertices, mesh.normals, eye))
     mesh = replace(mesh, color=(light[:, None] * _mesh_colors(mesh)).astype(np.uint8))
     corners = vertices[mesh.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = triangles.crosses(corners)
     pixels, depths = thumbnails.project(vertices, T, size, **lens)
     shown = (_cosines(corners[:, 0], normals, eye) > 0) & (depths[mesh.faces] > 0).all(1)
     t = scene.texture

@@ -274,6 +274,14 @@ def is_result(folder: Path) -> bool:
     return RESULT.is_ours(folder)
 
 
+def result_of_poses(path: Path) -> Path | None:
+    """Return the result whose poses a path names: itself, or by its trajectory.txt; else None."""
+    if path.name == "trajectory.txt":
+        return path.parent if is_result(path.parent) else None
+    # Nothing else that is read has a run.json, so that a damaged one is reported.
+    return path if (path / RESULT.marker).is_file() else None
+
+
 def read_json_object(path: Path) -> dict[str, object] | None:
     """Return the object in a JSON file; None if it can't be read or is something else."""
     try:

@@ -168,8 +168,7 @@ def _initial_estimate(
     u, v = se3.so3_log(A[:, :3, :3]), se3.so3_log(B[:, :3, :3])
     # Small angles only: near pi the axis flips.
     small = np.linalg.norm(u, axis=1) < 2.5
-    U, _, Vt = np.linalg.svd(u[small].T @ v[small])
-    R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+    R = se3.nearest_rotation(u[small].T @ v[small])
     M = (A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
     d = (B[:, :3, 3] @ R.T - A[:, :3, 3]).ravel()
     # Prior for directions that the motion does not constrain: the cameras are close together.

@@ -15,12 +15,11 @@ from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.color.color_views import (
     ColorView,
     Search,
-    homogeneous,
     matched,
 )
 from tofuse.engine.compute import run_all
 from tofuse.engine.frames import evenly_spaced
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import homogeneous, se3
 from tofuse.engine.graph import Measured
 
 # Earlier partners of a view, evenly spread over those that show this fraction of its patches.

@@ -12,6 +12,7 @@ from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import Camera
 from tofuse.engine.color import patch_kernels as kernels
 from tofuse.engine.frames import RangeFrame
+from tofuse.engine.geometry import homogeneous
 
 # Patches of a view, and the pixels of its image: of a larger one every n-th.
 POINTS, _PIXELS = 300, 1_000_000
@@ -159,11 +160,6 @@ class ColorView:
     @property
     def _zoom(self) -> float:
         return self.image.shape[1] / self.camera.width
-
-
-def homogeneous(rays: Float64) -> Float64:
-    """(N, 3) points at z = 1."""
-    return np.concatenate([rays, np.ones((len(rays), 1))], 1)
 
 
 def matched(

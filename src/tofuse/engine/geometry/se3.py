@@ -169,10 +169,19 @@ def interpolate(T_a: ArrayLike, T_b: ArrayLike, fraction: ArrayLike) -> Float64:
 def orthonormalise(T: ArrayLike) -> Float64:
     """Replace the rotation by the nearest orthogonal one (SVD), after long products of motions."""
     T = np.array(T, float)
-    U, _, Vt = np.linalg.svd(T[..., :3, :3])
-    U[..., :, 2] *= np.linalg.det(U @ Vt)[..., None]
-    T[..., :3, :3] = U @ Vt
+    T[..., :3, :3] = nearest_rotation(T[..., :3, :3])
     return T
+
+
+def nearest_rotation(M: ArrayLike) -> Float64:
+    """Return the rotations R (..., 3, 3) nearest to matrices M: ``R.T @ M`` has the largest trace.
+
+    With ``M = sum q p^T``, R rotates the vectors p to the q in least squares (Arun 1987; Umeyama
+    1991).
+    """
+    U, _, Vt = np.linalg.svd(np.asarray(M, float))
+    U[..., :, 2] *= np.linalg.det(U @ Vt)[..., None]
+    return np.asarray(U @ Vt, np.float64)
 
 
 def angle(R: ArrayLike) -> Float64:

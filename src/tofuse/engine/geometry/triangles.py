@@ -1,4 +1,4 @@
-"""Areas of triangles, and the points of them that are closest to others."""
+"""Areas of triangles, random points of them, and those that are closest to others."""
 
 from __future__ import annotations
 
@@ -9,10 +9,29 @@ from tofuse.engine.arrays import Float64
 _MIN_DETERMINANT = 1e-14  # relative: below it a triangle is a line, which its edges cover
 
 
+def crosses(triangles: Float64) -> Float64:
+    """Return normals (M, 3) of triangles (M, 3, 3), with twice their areas as length."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    return np.cross(b - a, c - a)
+
+
 def areas(triangles: Float64) -> Float64:
     """Return the areas (M,) of triangles (M, 3, 3), in squares of their unit."""
+    return np.asarray(0.5 * np.linalg.norm(crosses(triangles), axis=1))
+
+
+def random_points(triangles: Float64, count: int, rng: np.random.Generator) -> Float64:
+    """Return random points (count, 3) of triangles (M, 3, 3), evenly over their area."""
+    area = areas(triangles)
+    return points_in(triangles[rng.choice(len(triangles), count, p=area / area.sum())], rng)
+
+
+def points_in(triangles: Float64, rng: np.random.Generator) -> Float64:
+    """Return a random point (M, 3) of each of M triangles (M, 3, 3)."""
     a, b, c = np.moveaxis(triangles, 1, 0)
-    return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    u, v = rng.random((2, len(triangles), 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    return np.asarray(a + u * (b - a) + v * (c - a), np.float64)
 
 
 def closest_points(points: Float64, triangles: Float64) -> Float64:

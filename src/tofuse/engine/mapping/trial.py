@@ -33,7 +33,7 @@ from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float32, Float64, Intp
 from tofuse.engine.compute import run_all
 from tofuse.engine.frames import Frame, RangeFrame, Recording
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import homogeneous, se3
 from tofuse.engine.normal import robust_sigma
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
@@ -453,7 +453,7 @@ def _compared(
     valid = (plane[..., 3] > 0) & np.isfinite(change)
     plane, change = plane[valid], change[valid]
     variance = s.plane_variance[subset][valid].astype(float)
-    ray = np.concatenate([s.rays[subset][valid], np.ones((len(plane), 1))], 1).astype(float)
+    ray = homogeneous(s.rays[subset][valid])
     z = 1 / plane[:, 3]
     point = ray * z[:, None]
     R = T[:3, :3]
@@ -480,7 +480,7 @@ def _compared(
     )
     z, variance, v, u = z[valid], variance[valid], v[valid], u[valid]
     target_z = 1 / target_plane[valid, 3]
-    target_ray = np.concatenate([t.rays[v, u], np.ones((len(v), 1))], 1).astype(float)
+    target_ray = homogeneous(t.rays[v, u])
     normal_in_source = normal @ R
     target_point = target_ray * target_z[:, None]
     others = _by_other_errors(point, normal_in_source) - _by_other_errors(target_point, normal)

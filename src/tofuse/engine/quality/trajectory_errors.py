@@ -222,7 +222,7 @@ def align(estimate: ArrayLike, reference: ArrayLike, arm_m: float | None = None)
     T = np.eye(4)
     # The mean squared angle is half the mean squared difference of the matrices.
     weight = _ORIENTATION_WEIGHT if arm_m is None else arm_m**2 / 2
-    T[:3, :3] = nearest_rotation(cross_covariance + weight * mean_rotation_matrix)
+    T[:3, :3] = se3.nearest_rotation(cross_covariance + weight * mean_rotation_matrix)
     T[:3, 3] = centre_r - T[:3, :3] @ centre_e
     return T
 
@@ -260,13 +260,7 @@ def relative_error(estimate: Float64, reference: Float64, frames: int) -> Relati
 
 def mean_rotation(rotations: Float64) -> Float64:
     """Return the rotation (3, 3) nearest to the mean of rotations (N, 3, 3) (chordal mean)."""
-    return nearest_rotation(rotations.mean(0))
-
-
-def nearest_rotation(matrix: Float64) -> Float64:
-    """Return the rotation R (3, 3) with the largest trace of ``R.T @ matrix``."""
-    U, _, Vt = np.linalg.svd(matrix)
-    return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return se3.nearest_rotation(rotations.mean(0))
 
 
 def _coverage(

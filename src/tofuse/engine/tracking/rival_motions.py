@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import homogeneous, se3
 from tofuse.engine.search import pair_agreement
 from tofuse.engine.tracking import moving_object_kernels as kernels
 from tofuse.engine.tracking.moving_objects import compared, stride_of
@@ -228,7 +228,7 @@ def _pattern_residual(view: PreparedView, other: PreparedView, T: Float64, cells
     stride = stride_of(view)
     grid = np.s_[::stride, ::stride]
     z, rays, albedo = view.z[grid][cells], view.rays[grid][cells], view.albedo[grid][cells]
-    points = se3.transform(T, np.column_stack([rays, np.ones(len(z))]) * z[:, None])
+    points = se3.transform(T, homogeneous(rays) * z[:, None])
     pixels = pair_agreement.landing_pixels(other, points)
     size = np.array(other.z.shape[::-1])
     inside = np.all((pixels >= 0) & (pixels < size), axis=1)

@@ -8,6 +8,7 @@ import numpy as np
 
 from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, BrownConrady, Pinhole, RayTable
 from tofuse.engine.errors import InputError
+from tofuse.engine.geometry import homogeneous
 from tofuse.formats.cameras.camera_file import checked_lens
 
 
@@ -52,8 +53,7 @@ def forward_brown(table: RayTable, lens: BrownConrady) -> BrownConrady:
     )
     k1, k2, k3, p1, p2 = np.linalg.lstsq(rows, (slopes - rays).T.ravel(), rcond=None)[0]
     fitted = replace(lens, k1=float(k1), k2=float(k2), k3=float(k3), p1=float(p1), p2=float(p2))
-    points = np.concatenate([rays, np.ones((len(rays), 1))], axis=-1)
-    if not np.nanmax(np.abs(fitted.project(points) - slopes * focal - centre)) < 0.5:
+    if not np.nanmax(np.abs(fitted.project(homogeneous(rays)) - slopes * focal - centre)) < 0.5:
         raise InputError("has too much distortion to be inverted", where="lens")
     return fitted
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.frames import RangeFrame
+from tofuse.engine.geometry import homogeneous
 
 # Beyond this slope of a ray (60 degrees off the axis) a pinhole image is mostly stretched rim.
 MAX_SLOPE = 1.75
@@ -44,9 +45,7 @@ def pinhole_of(camera: Camera) -> Pinhole:
 
 def _nearest_pixels(camera: Camera, pinhole: Pinhole) -> tuple[Intp, Bool]:
     """Row and column (H, W, 2) of the pixel nearest to each pinhole ray, and whether it exists."""
-    rays = pinhole.rays().astype(float)
-    points = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
-    uv = np.rint(camera.project(points))
+    uv = np.rint(camera.project(homogeneous(pinhole.rays())))
     inside = np.asarray(
         np.isfinite(uv).all(-1)
         & (uv >= 0).all(-1)

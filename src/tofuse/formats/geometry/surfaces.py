@@ -10,6 +10,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord
+from tofuse.engine.geometry import triangles
 from tofuse.formats.files import reading
 from tofuse.formats.geometry.ply import read_ply
 
@@ -63,12 +64,9 @@ def surface_points(mesh: GeometryRecord, where: str | Path, count: int = _POINTS
     if mesh.faces is None or not len(mesh.faces):
         return points
     mesh.check(where)
-    a, b, c = np.moveaxis(points[mesh.faces], 1, 0)
-    area = np.nan_to_num(np.linalg.norm(np.cross(b - a, c - a), axis=1), posinf=0.0)
-    total = np.cumsum(area)
+    corners = points[mesh.faces]
+    total = np.cumsum(np.nan_to_num(triangles.areas(corners), posinf=0.0))
     if not total[-1] > 0:
         raise InputError("has faces without area", where=where, remedy="use a mesh of a surface")
     face = np.searchsorted(total, (np.arange(count) + 0.5) / count * total[-1])
-    u, v = np.random.default_rng(0).random((2, count, 1))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    return np.asarray(a[face] + u * (b - a)[face] + v * (c - a)[face], np.float64)
+    return triangles.points_in(corners[face], np.random.default_rng(0))

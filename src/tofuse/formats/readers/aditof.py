@@ -15,6 +15,7 @@ from tofuse.engine.arrays import Float32, Float64, UInt16
 from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_counts, evenly_spaced
+from tofuse.engine.geometry import unit_rays
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs
@@ -281,8 +282,7 @@ def _rays(samples: Sequence[tuple[Float64, Float64]]) -> Float32 | None:
     coefficients = fit.reshape(_DEGREE + 1, _DEGREE + 1, 2)
     rays = np.moveaxis(np.polynomial.legendre.leggrid2d(y, x, coefficients), 0, -1)
     rays[~has_ray] = np.nan
-    directions = np.concatenate([rays, np.ones((*shape, 1))], axis=-1)
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    directions = unit_rays(rays)
     error = [
         (points - directions * depth[..., None])[mask]
         for (depth, points), mask in zip(samples, masks, strict=True)

@@ -31,6 +31,7 @@ from tofuse.lab.experiments.bound import (
 from tofuse.lab.simulation import peaks
 
 SIGMAS_M = tuple(k / 100 for k in range(1, 11))
+_EXAMPLE_SIGMA_M = 0.09
 AXES = ("x", "y", "z", "yaw", "pitch", "roll")
 
 
@@ -221,6 +222,12 @@ class PeaksSweep:
     axes: Float64
     axes_std: Float64
     runs: tuple[PeaksRun, ...]
+
+    @property
+    def example(self) -> list[PeaksRun]:
+        """Runs of the sigma nearest to that of figure 5.11, for every seed."""
+        sigma = self.sigmas[np.abs(self.sigmas - _EXAMPLE_SIGMA_M).argmin()]
+        return [run for run in self.runs if run.sigma == sigma]
 
 
 def sweep_peaks(

@@ -11,10 +11,9 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.filters import apply_filters
-from tofuse.engine.frames import ArraySource, Frame, RangeFrame, Recording
-from tofuse.engine.geometry import se3
+from tofuse.engine.frames import ArraySource, Frame, Recording
+from tofuse.engine.geometry import se3, triangles
 from tofuse.engine.mapping import Config
-from tofuse.formats.cameras import corrected_depth
 from tofuse.lab.simulation import Effects, RecordingPlan, plan
 
 # About 1 cm apart in a room, so that distances are accurate to half of that.
@@ -64,7 +63,8 @@ class RecordedScene:
     def surface(self) -> Float64:
         """(K, 3) random points on the true surface, in its own frame (z up), m."""
         vertices, faces = self.plan.scene.truth_mesh()
-        return sample_surface(vertices[faces], _SURFACE_POINTS)
+        rng = np.random.default_rng([0, _SURFACE_POINTS])
+        return triangles.random_points(vertices[faces], _SURFACE_POINTS, rng)
 
     @cached_property
     def surface_tree(self) -> Any:
@@ -99,23 +99,5 @@ def record_scene(
     planned = plan(scene, seed=seed, every=1, frames=limit, effects=effects or Effects())
     needed = np.any([planned.raw % stride == 0 for stride in strides], axis=0)
     planned = replace(planned, raw=planned.raw[needed])
-    correction = planned.correction
-
-    def corrected(frame: RangeFrame) -> Frame:
-        depth = corrected_depth(correction, frame.camera, frame.depth, frame.depth_kind)
-        return replace(frame, depth=depth)
-
-    frames = tuple(corrected(rendered.frame) for rendered in planned.frames(progress))
+    frames = tuple(planned.corrected_frames(progress))
     return RecordedScene(planned, frames, planned.poses)
-
-
-def sample_surface(triangles: Float64, count: int) -> Float64:
-    """Sample points (count, 3) uniformly from triangles (F, 3, 3), with a fixed seed."""
-    a, b, c = np.swapaxes(triangles, 0, 1)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    rng = np.random.default_rng([0, count])
-    face = rng.choice(len(triangles), count, p=area / area.sum())
-    u, v = rng.random((2, count, 1))
-    flip = u + v > 1
-    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
-    return a[face] + u * (b - a)[face] + v * (c - a)[face]

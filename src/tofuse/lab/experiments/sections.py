@@ -17,8 +17,6 @@ from tofuse.lab.experiments.peaks import PeaksSweep
 from tofuse.lab.scenes import box, room
 from tofuse.lab.simulation import peaks
 
-_EXAMPLE_SIGMA = 0.09
-
 
 @dataclass(frozen=True)
 class Figure:
@@ -246,8 +244,7 @@ def _hull(points: Float64) -> Float64:
 
 def peaks_section(sweep: PeaksSweep) -> dict[str, Any]:
     """Return the template's values for the synthetic case."""
-    sigma = sweep.sigmas[np.abs(sweep.sigmas - _EXAMPLE_SIGMA).argmin()]
-    run = next(r for r in sweep.runs if r.sigma == sigma)
+    run = sweep.example[0]
     views, _ = peaks.peaks_views(run.sigma, run.seed)
     before, after = figures.example(run, [v.points.astype(float) for v in views])
     rows = []
@@ -264,7 +261,7 @@ def peaks_section(sweep: PeaksSweep) -> dict[str, Any]:
         "rows": rows,
         "seeds": len(sweep.runs) // len(sweep.sigmas),
         "example": [Figure(before), Figure(after)],
-        "example_sigma": f"{sigma:.2f}",
+        "example_sigma": f"{run.sigma:.2f}",
         "sweep": [Figure(s) for s in figures.sweep(sweep)],
         "objective": Figure(
             figures.objective(run.objective, label="Objective, synthetic data"),

@@ -67,11 +67,7 @@ class Surface:
         # Stratified sampling: one point in each of `count` equal parts of the area.
         at = (np.arange(count) + rng.random(count)) / count * cumulative[-1]
         face = np.minimum(np.searchsorted(cumulative, at, side="right"), len(corners) - 1)
-        u, v = rng.random((2, count, 1))
-        flip = u + v > 1
-        u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
-        a, b, c = (corners[face, k] for k in range(3))
-        return a + u * (b - a) + v * (c - a), face
+        return triangles.points_in(corners[face], rng), face
 
 
 @dataclass(frozen=True)

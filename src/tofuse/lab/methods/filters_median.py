@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from tofuse.engine.arrays import Bool, Float32
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.compute import run_chunks
 from tofuse.engine.filters import Filter
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
-from tofuse.lab.methods.window_median_kernels import window_median
 
 
 @part("filter", "median")
@@ -55,5 +54,12 @@ def local_median(z: Float32, size: int) -> Float32:
     number of values the two central ones are averaged.
     """
     out = np.zeros_like(z)
-    run_chunks(lambda a, b: window_median(z, size // 2, a, b, out), len(z))
+    unknown = np.float32(np.inf)
+    padded = np.pad(np.where(z > 0, z, unknown), size // 2, constant_values=unknown)
+    for row, windows in zip(out, sliding_window_view(padded, (size, size)), strict=True):
+        values = np.sort(windows.reshape(len(row), -1), axis=1)
+        count = (values < unknown).sum(1)
+        middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2], 1)
+        low, high = np.take_along_axis(values, middle, 1).T
+        row[:] = np.where(count > 0, np.float32(0.5) * (low + high), 0)
     return out

@@ -203,13 +203,6 @@ def closest_pairs(clouds: Sequence[Cloud], poses: Float64, reach: float) -> list
     return out
 
 
-def optimal_rotation(H: Float64) -> Float64:
-    """The rotation R (3, 3) that maximises the trace of R H (Arun 1987; Umeyama 1991)."""
-    U, _, Vt = np.linalg.svd(H)
-    sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    return np.asarray(Vt.T @ np.diag([1.0, 1.0, sign]) @ U.T)
-
-
 def _support(
     poses: Float64, pairs: Sequence[Pairs], reach: float, clouds: Sequence[Cloud]
 ) -> float:

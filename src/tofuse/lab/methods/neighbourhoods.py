@@ -8,13 +8,14 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64, Int64
+from tofuse.engine.arrays import Bool, Float64, Int64
 from tofuse.engine.geometry import KdTree
 from tofuse.engine.icp import interfaces, surface_shape
-from tofuse.lab.methods.curvature_kernels import mean_curvatures
 
 # A quadric through a point has five parameters; the point itself is its first neighbour.
 _MIN_NEIGHBOURS = 6
+# Smallest eigenvalue of the mean equations of a quadric that is determined.
+_MIN_EIGENVALUE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,22 +53,14 @@ class Neighbourhood:
     @cached_property
     def tangents(self) -> Float64:
         """(n, 2, 3) two unit tangents per normal; NaN where there is no normal."""
-        n = self._normals
-        axis = np.eye(3)[np.argmin(np.abs(np.nan_to_num(n)), axis=1)]
-        first = np.cross(n, axis)
-        first /= np.linalg.norm(first, axis=1, keepdims=True)
-        return np.stack([first, np.cross(n, first)], axis=1)
+        return _tangents(self._normals)
 
     @cached_property
     def principal_curvatures(self) -> PrincipalCurvatures:
         """Of the quadric ``w = a u^2 / 2 + b u v + c v^2 / 2 + d u + e v`` fitted at each point."""
         n = len(self._points)
         offsets = self._points[self.neighbours] - self._points[:, None]
-        u, v = np.moveaxis(np.einsum("nki,nti->nkt", offsets, self.tangents), 2, 0)
-        w = np.einsum("nki,ni->nk", offsets, self._normals)
-        scale = np.sqrt((u * u + v * v).mean(1)) + 1e-300
-        u, v, w = u / scale[:, None], v / scale[:, None], w / scale[:, None]
-        A = np.stack([u * u / 2, u * v, v * v / 2, u, v], axis=2)
+        A, w, scale = _quadric(offsets, self._normals, self.tangents)
         valid = np.isfinite(A).all((1, 2)) & (self.neighbours.shape[1] >= _MIN_NEIGHBOURS)
         x = np.zeros((n, 5))
         x[valid] = np.einsum("nij,nj->ni", np.linalg.pinv(A[valid], rcond=1e-6), w[valid])
@@ -114,12 +107,48 @@ def mean_curvature(points: interfaces.Points) -> Float64:
     It is positive where the surface bulges towards the sensor, and NaN where undetermined.
     """
     if points not in _mean_curvatures:
-        view, count = points.view, points.neighbours
-        index, _ = surface_shape.tree_of(view).neighbours(points.points, count)
-        _mean_curvatures[points] = mean_curvatures(
-            view.points.astype(np.float64), index, points.shape.normals
-        )
+        _mean_curvatures[points] = _fitted_mean_curvature(points)
     return _mean_curvatures[points]
+
+
+def _fitted_mean_curvature(points: interfaces.Points) -> Float64:
+    view, count = points.view, min(points.neighbours, len(points.view))
+    index, _ = surface_shape.tree_of(view).neighbours(points.points, count)
+    near, normals = view.points.astype(np.float64)[index], points.shape.normals
+    offsets = near - near.mean(1, keepdims=True)
+    A, w, scale = _quadric(offsets, normals, _tangents(normals))
+    A = np.concatenate([A, np.ones_like(w)[..., None]], 2)
+    At = np.swapaxes(A, 1, 2)
+    M, g = At @ A, At @ w[..., None]
+    valid: Bool = np.asarray(np.isfinite(M).all((1, 2)))
+    valid[valid] = np.linalg.eigvalsh(M[valid])[:, 0] > _MIN_EIGENVALUE * count
+    x = np.full((len(M), 6), np.nan)
+    x[valid] = np.linalg.solve(M[valid], g[valid])[..., 0]
+    a, b, c, d, e, _ = x.T
+    bend = (1 + e * e) * a - 2 * d * e * b + (1 + d * d) * c
+    return np.asarray(-bend / (2 * scale * (1 + d * d + e * e) ** 1.5), np.float64)
+
+
+def _tangents(normals: Float64) -> Float64:
+    """(n, 2, 3) two unit tangents per normal; NaN where there is no normal."""
+    axis = np.eye(3)[np.argmin(np.abs(np.nan_to_num(normals)), axis=1)]
+    first = np.cross(normals, axis)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(normals, first)], axis=1)
+
+
+def _quadric(
+    offsets: Float64, normals: Float64, tangents: Float64
+) -> tuple[Float64, Float64, Float64]:
+    """Equations ``A x = w`` of quadrics ``w = a u^2 / 2 + b u v + c v^2 / 2 + d u + e v``.
+
+    Returns A (n, k, 5) and w (n, k) for k points each, in units of their rms distance (n,).
+    """
+    u, v = np.moveaxis(np.einsum("nki,nti->nkt", offsets, tangents), 2, 0)
+    w = np.einsum("nki,ni->nk", offsets, normals)
+    scale = np.sqrt((u * u + v * v).mean(1)) + 1e-300
+    u, v, w = u / scale[:, None], v / scale[:, None], w / scale[:, None]
+    return np.stack([u * u / 2, u * v, v * v / 2, u, v], axis=2), w, scale
 
 
 def with_normals(

@@ -208,11 +208,9 @@ def _rotations(a: Float64, b: Float64, guess: Float64, tolerance: float) -> Iter
 def _align_normals(a: Float64, b: Float64, prior: Float64) -> Float64:
     """Rotation (3, 3) that best aligns normals a (n, 3) with b (n, 3), close to `prior`.
 
-    Wahba's problem by the SVD (Arun et al. 1987); a small weight of `prior` regularises it.
+    A small weight of `prior` regularises it.
     """
-    H = b.T @ a + 1e-4 * prior
-    U, _, Vt = np.linalg.svd(H)
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt, np.float64)
+    return se3.nearest_rotation(b.T @ a + 1e-4 * prior)
 
 
 def _independent(pairs: list[tuple[int, int]], normals: Float64) -> Iterator[list[tuple[int, int]]]:

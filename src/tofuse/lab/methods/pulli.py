@@ -18,7 +18,6 @@ from tofuse.lab.methods.multiview import (
     Cloud,
     Pairs,
     RelaxationMethod,
-    optimal_rotation,
     resolution_of,
 )
 
@@ -122,7 +121,7 @@ def _align_view(k: int, poses: Float64, constraints: Sequence[Pairs]) -> Float64
     )
     a, b = own_points.mean(0), other_points.mean(0)
     T = np.eye(4)
-    T[:3, :3] = optimal_rotation((own_points - a).T @ (other_points - b))
+    T[:3, :3] = se3.nearest_rotation((other_points - b).T @ (own_points - a))
     T[:3, 3] = b - T[:3, :3] @ a
     return T
 

@@ -64,11 +64,7 @@ def information_of(pairs: robust_motion.Pairs, T_target_source: Float64) -> Floa
     residual = se3.transform(T_target_source, p) - pairs.target
     degrees_of_freedom = max(3 * len(p) - 6, 1)
     scale = max(1.0, float((residual**2 / pairs.variance[:, None]).sum()) / degrees_of_freedom)
-    J = np.zeros((len(p), 3, 6))
-    J[:, :, :3] = np.eye(3)
-    J[:, 0, 4], J[:, 0, 5] = p[:, 2], -p[:, 1]
-    J[:, 1, 3], J[:, 1, 5] = -p[:, 2], p[:, 0]
-    J[:, 2, 3], J[:, 2, 4] = p[:, 1], -p[:, 0]
+    J = se3.point_jacobian(p)
     weight = 1 / (scale * pairs.variance)
     return np.asarray(np.einsum("kai,kaj,k->ij", J, J, weight), np.float64)
 

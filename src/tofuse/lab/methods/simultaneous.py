@@ -12,7 +12,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp import icp_kernels
 from tofuse.engine.parts import part
-from tofuse.lab.methods.multiview import Cloud, Pairs, RelaxationMethod, optimal_rotation
+from tofuse.lab.methods.multiview import Cloud, Pairs, RelaxationMethod
 
 # Weight of the fixed first view relative to all pairs.
 _GAUGE_WEIGHT = 1e6
@@ -77,7 +77,7 @@ def solve_correspondences(
         for k in range(n):
             H = np.einsum("jkl,jml->km", np.delete(Q[k], k, 0), np.delete(R, k, 0))
             if H.any():
-                R[k] = optimal_rotation(H)
+                R[k] = se3.nearest_rotation(H.T)
         error = -float(np.einsum("iab,ijbc,jac->", R, Q, R))
         errors.append(error)
         if len(errors) > 1 and errors[-2] - errors[-1] <= _MIN_RELATIVE_DECREASE * abs(errors[-1]):

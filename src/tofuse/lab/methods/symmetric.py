@@ -11,7 +11,6 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp import icp_kernels, interfaces, surface_metrics
 from tofuse.engine.parts import part
-from tofuse.lab.methods.symmetric_kernels import symmetric_sums
 
 
 @part("metric", "symmetric", label="validated")
@@ -41,7 +40,9 @@ class Symmetric(surface_metrics.SurfaceMetric):
         p = pairs.points
         q = p - pairs.residual
         centre = (p.mean(0) + q.mean(0)) / 2
-        H, g = symmetric_sums(p - centre, q - centre, n, weight)
+        J = np.hstack([n, np.cross(p + q - 2 * centre, n)])
+        # Not by BLAS, whose sums depend on the number of threads.
+        H, g = np.einsum("k,ki,kj->ij", weight, J, J), np.einsum("k,ki->i", weight * r, J)
         x = surface_metrics.solve(H, g, 2 * pairs.size)
         tangent = float(np.linalg.norm(x[3:]))
         angle = math.atan(tangent)

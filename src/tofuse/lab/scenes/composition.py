@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Self
 
 import numpy as np
 
@@ -18,11 +20,20 @@ class Assembly:
     def __init__(self, materials: list[Material]) -> None:
         self.materials = materials
         self._parts: list[Mesh] = []
+        self._T: Float64 | None = None
+
+    def at(self, T: Float64) -> Self:
+        """Return the same assembly, to which parts are added at a pose T (4, 4)."""
+        placed = copy.copy(self)
+        placed._T = T
+        return placed
 
     def add(self, material: Material, *parts: Mesh) -> None:
         """Add parts made of a material."""
         surface = self._id(material)
-        self._parts.extend(part.of_surface(surface) for part in parts)
+        for part in parts:
+            placed = part if self._T is None else part.transformed(self._T)
+            self._parts.append(placed.of_surface(surface))
 
     def add_mixed(self, materials: Sequence[Material], part: Mesh) -> None:
         """Add one part whose surface ids index `materials`."""

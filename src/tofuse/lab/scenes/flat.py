@@ -73,20 +73,20 @@ def plan(options: SceneOptions) -> ScenePlan:
         rng = np.random.default_rng([options.seed, 3, room])
         style = 0 if alike else room
         T = T_flat_room(room)
-        _walls(assembly, SIDES[style], FLOORS[style], T)
-        _doorway(assembly, SIDES[style], T)
+        _walls(assembly.at(T), SIDES[style], FLOORS[style])
+        _doorway(assembly.at(T), SIDES[style])
         furnish = _study if alike else _FURNISHED[room]
         furnish(assembly, T, rng, room)
     path = _walk(options.seconds, np.random.default_rng([options.seed, 4]))
     return ScenePlan(assembly.materials, assembly.mesh(), path, ambient=0.3)
 
 
-def _walls(assembly: Assembly, side: Material, floor: Material, T: Float64) -> None:
+def _walls(assembly: Assembly, side: Material, floor: Material) -> None:
     """Add floor, ceiling and walls, with openings in the walls at +x and +y."""
     a, h, d = HALF, HEIGHT, DOOR / 2
     quad = meshes.quad
-    assembly.add(floor, quad((-a, -a, 0), (2 * a, 0, 0), (0, 2 * a, 0)).transformed(T))
-    assembly.add(CEILING, quad((-a, -a, h), (0, 2 * a, 0), (2 * a, 0, 0)).transformed(T))
+    assembly.add(floor, quad((-a, -a, 0), (2 * a, 0, 0), (0, 2 * a, 0)))
+    assembly.add(CEILING, quad((-a, -a, h), (0, 2 * a, 0), (2 * a, 0, 0)))
     parts = [
         quad((-a, -a, 0), (0, 2 * a, 0), (0, 0, h)),
         quad((-a, -a, 0), (0, 0, h), (2 * a, 0, 0)),
@@ -100,15 +100,15 @@ def _walls(assembly: Assembly, side: Material, floor: Material, T: Float64) -> N
             quad(p + (beside_door + DOOR) * u, beside_door * u, h * up),
             quad(p + beside_door * u + DOOR_TOP * up, DOOR * u, (h - DOOR_TOP) * up),
         ]
-    assembly.add(side, *(part.transformed(T) for part in parts))
+    assembly.add(side, *parts)
     skirting = [
         meshes.box_between((-a, -a, 0), (-a + 0.012, a, 0.08)),
         meshes.box_between((-a, -a, 0), (a, -a + 0.012, 0.08)),
     ]
-    assembly.add(CASING, *(part.transformed(T) for part in skirting))
+    assembly.add(CASING, *skirting)
 
 
-def _doorway(assembly: Assembly, side: Material, T: Float64) -> None:
+def _doorway(assembly: Assembly, side: Material) -> None:
     """Line the doorway at +x, through the wall, and frame it."""
     a, d, top = HALF, DOOR / 2, DOOR_TOP
     lining = [
@@ -117,14 +117,14 @@ def _doorway(assembly: Assembly, side: Material, T: Float64) -> None:
         meshes.quad((a, -d, 0), (WALL, 0, 0), (0, DOOR, 0)),
         meshes.quad((a, -d, top), (WALL, 0, 0), (0, DOOR, 0)),
     ]
-    assembly.add(side, *(part.transformed(T) for part in lining))
+    assembly.add(side, *lining)
     for x in (a - 0.02, a + WALL):
         posts = [
             meshes.box_between((x, -d - 0.07, 0), (x + 0.02, -d, top + 0.07)),
             meshes.box_between((x, d, 0), (x + 0.02, d + 0.07, top + 0.07)),
             meshes.box_between((x, -d, top), (x + 0.02, d, top + 0.07)),
         ]
-        assembly.add(CASING, *(part.transformed(T) for part in posts))
+        assembly.add(CASING, *posts)
 
 
 def _poster(
@@ -132,7 +132,7 @@ def _poster(
 ) -> None:
     """Hang a poster on the wall at -x."""
     low, high = (-HALF, at, 1.55 - size[1] / 2), (-HALF + 0.006, at + size[0], 1.55 + size[1] / 2)
-    assembly.add(POSTERS[room], meshes.box_between(low, high).transformed(T))
+    assembly.at(T).add(POSTERS[room], meshes.box_between(low, high))
 
 
 def _study(assembly: Assembly, T: Float64, rng: np.random.Generator, room: int) -> None:
@@ -142,43 +142,42 @@ def _study(assembly: Assembly, T: Float64, rng: np.random.Generator, room: int) 
         jitter = rng.normal(0.0, 0.03, 2)
         return T @ placed((x + jitter[0], y + jitter[1]), yaw + np.deg2rad(rng.normal(0.0, 3.0)))
 
-    furniture.desk(assembly, jittered(-1.70, -0.15, 0.0))
-    furniture.chair(
-        assembly, FABRICS[0], jittered(-1.12, -0.25, np.deg2rad(200 + rng.normal(0, 15)))
-    )
-    household.shelf(assembly, jittered(0.70, -HALF + 0.08, np.pi / 2), rng)
-    furniture.plant(assembly, jittered(-1.75, -1.75, 0.0), rng)
-    household.cabinet(assembly, household.OAK, jittered(1.95, 1.45, np.pi), (0.42, 1.0, 0.9))
+    furniture.desk(assembly.at(jittered(-1.70, -0.15, 0.0)))
+    seat = jittered(-1.12, -0.25, np.deg2rad(200 + rng.normal(0, 15)))
+    furniture.chair(assembly.at(seat), FABRICS[0])
+    household.shelf(assembly.at(jittered(0.70, -HALF + 0.08, np.pi / 2)), rng)
+    furniture.plant(assembly.at(jittered(-1.75, -1.75, 0.0)), rng)
+    household.cabinet(assembly.at(jittered(1.95, 1.45, np.pi)), household.OAK, (0.42, 1.0, 0.9))
     _poster(assembly, T, 0, -0.9 + rng.normal(0, 0.04), (0.7, 0.5))
 
 
 def _living(assembly: Assembly, T: Float64, rng: np.random.Generator, room: int) -> None:
-    household.sofa(assembly, FABRICS[1], T @ placed((-1.72, -0.4), 0.0))
+    household.sofa(assembly.at(T @ placed((-1.72, -0.4), 0.0)), FABRICS[1])
     low = T @ placed((-1.0, -1.35), 0.3)
-    household.table(assembly, household.BIRCH, low, (0.6, 0.9), 0.42)
-    household.shelf(assembly, T @ placed((0.9, -HALF + 0.01), np.pi / 2), rng, 1.6, 4)
-    household.floor_lamp(assembly, T @ placed((-1.8, 0.85), 0.0))
-    furniture.plant(assembly, T @ placed((1.7, 1.7), 0.0), rng)
+    household.table(assembly.at(low), household.BIRCH, (0.6, 0.9), 0.42)
+    household.shelf(assembly.at(T @ placed((0.9, -HALF + 0.01), np.pi / 2)), rng, 1.6, 4)
+    household.floor_lamp(assembly.at(T @ placed((-1.8, 0.85), 0.0)))
+    furniture.plant(assembly.at(T @ placed((1.7, 1.7), 0.0)), rng)
     _poster(assembly, T, room, -1.1, (1.2, 0.7))
 
 
 def _bedroom(assembly: Assembly, T: Float64, rng: np.random.Generator, room: int) -> None:
-    household.bed(assembly, T @ placed((-1.12, -1.65), 0.0))
+    household.bed(assembly.at(T @ placed((-1.12, -1.65), 0.0)))
     tall = (0.58, 1.2, 2.0)
-    household.cabinet(assembly, household.BIRCH, T @ placed((-HALF, 0.6), 0.0), tall)
-    furniture.chair(assembly, FABRICS[2], T @ placed((1.5, -1.6), 2.2), arms=False)
-    household.floor_lamp(assembly, T @ placed((0.35, -1.9), 0.0))
-    household.cabinet(assembly, household.OAK, T @ placed((HALF, 1.4), np.pi), (0.45, 0.9, 1.1))
+    household.cabinet(assembly.at(T @ placed((-HALF, 0.6), 0.0)), household.BIRCH, tall)
+    furniture.chair(assembly.at(T @ placed((1.5, -1.6), 2.2)), FABRICS[2], arms=False)
+    household.floor_lamp(assembly.at(T @ placed((0.35, -1.9), 0.0)))
+    household.cabinet(assembly.at(T @ placed((HALF, 1.4), np.pi)), household.OAK, (0.45, 0.9, 1.1))
     _poster(assembly, T, room, -0.7, (0.5, 0.8))
 
 
 def _dining(assembly: Assembly, T: Float64, rng: np.random.Generator, room: int) -> None:
-    household.table(assembly, household.OAK, T @ placed((-1.30, -1.05), 0.15))
+    household.table(assembly.at(T @ placed((-1.30, -1.05), 0.15)), household.OAK)
     for x, y, yaw in ((-1.45, -1.85, 1.3), (-1.95, -1.1, 0.2), (-1.35, -0.15, -1.7)):
-        furniture.chair(assembly, FABRICS[3], T @ placed((x, y), yaw), arms=False)
+        furniture.chair(assembly.at(T @ placed((x, y), yaw)), FABRICS[3], arms=False)
     low = (0.45, 1.4, 0.85)
-    household.cabinet(assembly, household.BIRCH, T @ placed((0.95, -HALF), np.pi / 2), low)
-    furniture.plant(assembly, T @ placed((-1.8, 1.7), 0.0), rng)
+    household.cabinet(assembly.at(T @ placed((0.95, -HALF), np.pi / 2)), household.BIRCH, low)
+    furniture.plant(assembly.at(T @ placed((-1.8, 1.7), 0.0)), rng)
     _poster(assembly, T, room, 0.1, (0.6, 0.9))
 
 

@@ -59,7 +59,7 @@ def backrest() -> Mesh:
     return panel.warped(curve).translated(-0.235, 0, 0.84)
 
 
-def chair(assembly: Assembly, fabric: Material, T: Float64, *, arms: bool = True) -> None:
+def chair(assembly: Assembly, fabric: Material, *, arms: bool = True) -> None:
     """Add an office chair: five-star base, column, seat, back, armrests."""
     frame = star_base()
     frame.append(meshes.box((0.24, 0.18, 0.045), (-0.02, 0, 0.405)))
@@ -73,13 +73,13 @@ def chair(assembly: Assembly, fabric: Material, T: Float64, *, arms: bool = True
             frame.append(meshes.rod((-0.02, y, 0.42), (-0.03, y, 0.655), 0.02, 0.018, 8))
             pad = meshes.superellipsoid((0.27, 0.075, 0.035), (0.5, 0.5), (6, 16))
             frame.append(pad.translated(0.01, y, 0.67))
-    assembly.add(PLASTIC, *(part.transformed(T) for part in frame))
+    assembly.add(PLASTIC, *frame)
     column = [
         meshes.rod((0, 0, 0.12), (0, 0, 0.28), 0.028),
         meshes.rod((0, 0, 0.28), (0, 0, 0.40), 0.016),
     ]
-    assembly.add(CHROME, *(part.transformed(T) for part in column))
-    assembly.add(fabric, cushion().transformed(T), backrest().transformed(T))
+    assembly.add(CHROME, *column)
+    assembly.add(fabric, cushion(), backrest())
 
 
 WOOD = Material("desk", 0.42, 0.2, "wood", (0.9, 0.9, 0.05))
@@ -97,13 +97,10 @@ BOOKS = [
 LAMP = Material("lamp", 0.6, 0.0, "plain", gloss=0.1)
 
 
-def desk(assembly: Assembly, T: Float64) -> None:
+def desk(assembly: Assembly) -> None:
     """Add a desk of 1.6 x 0.75 x 0.73 m, long along y, the sitter at +x, with objects on it."""
     top = 0.73
-
-    def add(material: Material, *parts: Mesh) -> None:
-        assembly.add(material, *(part.transformed(T) for part in parts))
-
+    add = assembly.add
     add(WOOD, meshes.box_between((-0.375, -0.8, top - 0.03), (0.375, 0.8, top)))
     add(WOOD, meshes.box_between((-0.34, -0.74, 0.35), (-0.32, 0.74, top - 0.03)))
     legs = [
@@ -185,11 +182,11 @@ def leaf(length: float, width: float, droop: float) -> Mesh:
     return meshes.grid(points)
 
 
-def plant(assembly: Assembly, T: Float64, rng: np.random.Generator, leaves: int = 34) -> None:
+def plant(assembly: Assembly, rng: np.random.Generator, leaves: int = 34) -> None:
     """Add a potted plastic plant, 1.1 m high: stems that fan out, with broad leaves."""
     pot = [(0, 0), (0.12, 0), (0.165, 0.27), (0.175, 0.27), (0.175, 0.30), (0.155, 0.30)]
-    assembly.add(POT, meshes.lathe([*pot, (0.15, 0.26)], 28).transformed(T))
-    assembly.add(SOIL, meshes.lathe([(0.152, 0.262), (0, 0.275)], 20).transformed(T))
+    assembly.add(POT, meshes.lathe([*pot, (0.15, 0.26)], 28))
+    assembly.add(SOIL, meshes.lathe([(0.152, 0.262), (0, 0.275)], 20))
     stems: list[Mesh] = []
     foliage: list[Mesh] = []
     golden = np.pi * (3 - np.sqrt(5))
@@ -212,5 +209,5 @@ def plant(assembly: Assembly, T: Float64, rng: np.random.Generator, leaves: int 
         pose[:3, 3] = tip
         foliage.append(blade.transformed(pose))
     stems.append(meshes.rod((0, 0, 0.25), (0, 0, 0.72), 0.014, 0.008, 8))
-    assembly.add(STEM, *(part.transformed(T) for part in stems))
-    assembly.add(LEAF, *(part.transformed(T) for part in foliage))
+    assembly.add(STEM, *stems)
+    assembly.add(LEAF, *foliage)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64
 from tofuse.lab.scenes.composition import Assembly
-from tofuse.lab.world import Material, Mesh
+from tofuse.lab.world import Material
 from tofuse.lab.world import mesh as meshes
 
 OAK = Material("oak", 0.46, 0.2, "wood", (0.9, 0.9, 0.05))
@@ -21,11 +20,7 @@ SPINES = [
 ]
 
 
-def _add(assembly: Assembly, material: Material, T: Float64, *parts: Mesh) -> None:
-    assembly.add(material, *(part.transformed(T) for part in parts))
-
-
-def sofa(assembly: Assembly, fabric: Material, T: Float64, width: float = 1.7) -> None:
+def sofa(assembly: Assembly, fabric: Material, width: float = 1.7) -> None:
     """Add a sofa, 0.85 m deep and 0.85 m high."""
     half = width / 2
     roundness = (0.25, 0.3)
@@ -38,17 +33,15 @@ def sofa(assembly: Assembly, fabric: Material, T: Float64, width: float = 1.7) -
         parts.append(arm.translated(0, side * (half - 0.08), 0.34))
         seat = meshes.superellipsoid((0.62, half - 0.18, 0.18), (0.3, 0.3))
         parts.append(seat.translated(0.10, side * (half - 0.16) / 2, 0.37))
-    _add(assembly, fabric, T, *parts)
+    assembly.add(fabric, *parts)
     pillow = meshes.superellipsoid((0.14, 0.42, 0.40), (0.7, 0.6))
-    _add(assembly, QUILT, T, pillow.translated(-0.12, 0.24 * width, 0.62))
+    assembly.add(QUILT, pillow.translated(-0.12, 0.24 * width, 0.62))
 
 
-def bed(assembly: Assembly, T: Float64) -> None:
+def bed(assembly: Assembly) -> None:
     """Add a bed of 2.0 x 0.95 m, its head at -x."""
-    _add(
-        assembly,
+    assembly.add(
         OAK,
-        T,
         meshes.box_between((-1.0, -0.475, 0.12), (1.0, 0.475, 0.30)),
         meshes.box_between((-1.03, -0.475, 0), (-0.98, 0.475, 0.85)),
         *(
@@ -59,21 +52,19 @@ def bed(assembly: Assembly, T: Float64) -> None:
     )
     mattress = meshes.superellipsoid((1.96, 0.93, 0.22), (0.25, 0.25)).translated(0, 0, 0.40)
     pillow = meshes.superellipsoid((0.45, 0.70, 0.16), (0.7, 0.5)).translated(-0.68, 0.02, 0.56)
-    _add(assembly, LINEN, T, mattress, pillow)
+    assembly.add(LINEN, mattress, pillow)
     quilt = meshes.superellipsoid((1.25, 1.02, 0.20), (0.5, 0.3)).translated(0.36, 0.01, 0.46)
-    _add(assembly, QUILT, T, quilt)
+    assembly.add(QUILT, quilt)
 
 
 def shelf(
-    assembly: Assembly, T: Float64, rng: np.random.Generator, width: float = 0.9, boards: int = 6
+    assembly: Assembly, rng: np.random.Generator, width: float = 0.9, boards: int = 6
 ) -> None:
     """Add a shelf 0.30 m deep with books of random sizes; its back is at x = 0."""
     pitch, half = 0.34, width / 2
     top = 0.04 + pitch * (boards - 1)
-    _add(
-        assembly,
+    assembly.add(
         BIRCH,
-        T,
         *(
             meshes.box_between((0, -half, 0.04 + pitch * k), (0.30, half, 0.06 + pitch * k))
             for k in range(boards)
@@ -95,14 +86,13 @@ def shelf(
             book = meshes.box_between(
                 (0.01, left, low), (depth, left + thickness - 0.002, low + height)
             )
-            _add(assembly, SPINES[int(rng.integers(len(SPINES)))], T, book)
+            assembly.add(SPINES[int(rng.integers(len(SPINES)))], book)
             left += thickness
 
 
 def table(
     assembly: Assembly,
     wood: Material,
-    T: Float64,
     size: tuple[float, float] = (0.8, 1.2),
     height: float = 0.74,
 ) -> None:
@@ -114,22 +104,18 @@ def table(
         for a in (0.06 - x, x - 0.06)
         for b in (0.06 - y, y - 0.06)
     ]
-    _add(assembly, wood, T, top, *legs)
+    assembly.add(wood, top, *legs)
     bowl = [(0, 0.0), (0.06, 0.0), (0.15, 0.07), (0.145, 0.075), (0.05, 0.012), (0, 0.012)]
-    _add(assembly, LINEN, T, meshes.lathe(bowl, 20).translated(0.05, -0.1, height))
+    assembly.add(LINEN, meshes.lathe(bowl, 20).translated(0.05, -0.1, height))
 
 
-def cabinet(
-    assembly: Assembly, wood: Material, T: Float64, size: tuple[float, float, float]
-) -> None:
+def cabinet(assembly: Assembly, wood: Material, size: tuple[float, float, float]) -> None:
     """Add a closed cabinet with two doors (depth, width, height); its back is at x = 0."""
     depth, width, height = size
     half = width / 2
-    _add(assembly, wood, T, meshes.box_between((0, -half, 0.06), (depth - 0.02, half, height)))
-    _add(
-        assembly,
+    assembly.add(
         wood,
-        T,
+        meshes.box_between((0, -half, 0.06), (depth - 0.02, half, height)),
         meshes.box_between((depth - 0.02, -half + 0.005, 0.07), (depth, -0.004, height - 0.01)),
         meshes.box_between((depth - 0.02, 0.004, 0.07), (depth, half - 0.005, height - 0.01)),
     )
@@ -140,16 +126,14 @@ def cabinet(
         )
         for y in (-0.05, 0.05)
     ]
-    _add(assembly, IRON, T, *handles)
+    assembly.add(IRON, *handles)
 
 
-def floor_lamp(assembly: Assembly, T: Float64) -> None:
+def floor_lamp(assembly: Assembly) -> None:
     """Add a lamp 1.6 m high."""
-    _add(
-        assembly,
+    assembly.add(
         IRON,
-        T,
         meshes.rod((0, 0, 0), (0, 0, 0.025), 0.15, segments=20),
         meshes.rod((0, 0, 0.025), (0, 0, 1.35), 0.014, segments=8),
     )
-    _add(assembly, SHADE, T, meshes.rod((0, 0, 1.32), (0, 0, 1.60), 0.22, 0.15, 24))
+    assembly.add(SHADE, meshes.rod((0, 0, 1.32), (0, 0, 1.60), 0.22, 0.15, 24))

@@ -28,10 +28,10 @@ def plan(options: SceneOptions) -> ScenePlan:
     assembly.add(POSTER, meshes.box_between((-1.0, 2.994, 1.05), (-0.4, 3.0, 1.75)))
     assembly.add(CALENDAR, meshes.box_between((0.75, 2.994, 1.15), (1.15, 3.0, 1.65)))
     # The sitter's side of the desk faces the camera.
-    furniture.desk(assembly, placed((0.05, 2.45), -np.pi / 2))
-    furniture.chair(assembly, FABRIC, placed((0.62, 1.75), np.deg2rad(140.0)))
+    furniture.desk(assembly.at(placed((0.05, 2.45), -np.pi / 2)))
+    furniture.chair(assembly.at(placed((0.62, 1.75), np.deg2rad(140.0))), FABRIC)
     rng = np.random.default_rng([options.seed, 3])
-    furniture.plant(assembly, placed((-0.98, 2.25), 0.0), rng)
+    furniture.plant(assembly.at(placed((-0.98, 2.25), 0.0)), rng)
     camera = paths.look_at((-RAIL_LENGTH / 2, 0, 1.15), (-RAIL_LENGTH / 2, 2.4, 0.80))
     path = paths.out_and_back(camera, RAIL_LENGTH, options.seconds)
     return ScenePlan(assembly.materials, assembly.mesh(), path, ambient=0.3)

@@ -107,4 +107,4 @@ def _chairs(assembly: Assembly, rng: np.random.Generator) -> None:
         position = np.array([c, s]) / np.hypot(c / 2.15, s / 1.12)
         T = paths.rotation([0, 0, azimuth + np.pi + rng.uniform(-0.9, 0.9)])
         T[:2, 3] = position
-        furniture.chair(assembly, fabric, T, arms=k % 3 != 1)
+        furniture.chair(assembly.at(T), fabric, arms=k % 3 != 1)

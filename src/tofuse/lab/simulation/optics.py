@@ -12,6 +12,7 @@ from scipy.constants import speed_of_light
 from tofuse.engine.arrays import Bool, Float64, Int32
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.compute import run_chunks
+from tofuse.engine.geometry import unit_rays
 from tofuse.lab.simulation import phasor_kernels as phasor
 from tofuse.lab.simulation.models import CameraModel
 from tofuse.lab.world import Scene
@@ -64,7 +65,7 @@ def ray_grid(model: CameraModel, mixed: bool) -> RayGrid:
     """
     camera = model.camera
     if not mixed:
-        return RayGrid(_directions(camera), 1, np.ones(1))
+        return RayGrid(unit_rays(camera.rays()), 1, np.ones(1))
     fine: Pinhole = replace(
         camera,
         width=2 * camera.width + 1,
@@ -74,13 +75,7 @@ def ray_grid(model: CameraModel, mixed: bool) -> RayGrid:
         cx=2 * camera.cx + 1,
         cy=2 * camera.cy + 1,
     )
-    return RayGrid(_directions(fine), 2, np.array([0.25, 0.5, 0.25]))
-
-
-def _directions(camera: Pinhole) -> Float64:
-    rays = camera.rays().astype(float)
-    out = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1)
-    return out / np.linalg.norm(out, axis=-1, keepdims=True)
+    return RayGrid(unit_rays(fine.rays()), 2, np.array([0.25, 0.5, 0.25]))
 
 
 @dataclass(frozen=True, eq=False)

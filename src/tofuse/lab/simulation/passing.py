@@ -15,7 +15,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, unit_rays
 from tofuse.lab.scenes import HAIR, SHIRT, SKIN, TROUSERS
 from tofuse.lab.simulation.models import CameraModel
 from tofuse.lab.world import Body, Material, Mesh, Scene, Sequence, paths
@@ -219,9 +219,7 @@ class _View:
         step = max(1, camera.width // _COLUMNS)
         xy = camera.rays()[step // 2 :: step, step // 2 :: step].reshape(-1, 2).astype(float)
         xy = xy[np.isfinite(xy).all(1)]
-        rays = np.column_stack([xy, np.ones(len(xy))])
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        return cls(rays, float(np.arctan(np.abs(xy[:, 0]).max())))
+        return cls(unit_rays(xy), float(np.arctan(np.abs(xy[:, 0]).max())))
 
     def coverage(
         self, T_room_camera: Float64, bodies: SequenceOf[Body], poses: SequenceOf[Float64]

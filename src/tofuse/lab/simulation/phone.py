@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from tofuse.engine.arrays import Float64, UInt8, UInt16
 from tofuse.engine.cameras import Pinhole, scaled
 from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import homogeneous, se3
 from tofuse.formats.files import atomic, staging
 from tofuse.formats.images import jpeg_bytes, write_png
 from tofuse.formats.poses import write_tum
@@ -198,8 +198,7 @@ class PhonePlan:
 
     def _cast(self, camera: Pinhole, t: float, readout: float) -> scenes.Hits:
         """Return what the rays of an image hit, row by row in `readout` s."""
-        rays = camera.rays().astype(float)
-        rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], 2)
+        rays = homogeneous(camera.rays())
         rows = t + readout * ((np.arange(camera.height) + 0.5) / camera.height - 0.5)
         poses = np.stack([self.motion.T_room_camera(r) for r in (rows if readout else rows[:1])])
         directions = rays @ np.swapaxes(poses[:, :3, :3], 1, 2)

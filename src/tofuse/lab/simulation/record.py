@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
@@ -81,17 +82,41 @@ class RecordingPlan:
             if progress is not None:
                 progress(k + 1, len(self.raw))
 
+    def corrected_frames(self, progress: Progress | None = None) -> Iterator[RangeFrame]:
+        """Render the frames, and apply the factory correction."""
+        correction = self.correction
+        for rendered in self.frames(progress):
+            yield corrected(rendered.frame, correction)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What camera.json says of the images."""
+        model = self.model
+        return {
+            "frame_rate_hz": self.sequence.frame_rate_hz,
+            "ambiguity_m": model.ambiguity_m,
+            "confidence_max": model.confidence_max,
+            "amplitude_kind": model.amplitude_kind,
+            "depth_unit_m": model.depth_unit_m,
+            "depth_kind": model.depth_kind,
+        }
+
     def recording(self, *, correction: bool = True, progress: Progress | None = None) -> Recording:
         """Render it in memory, with the true poses as its reference; see `simulate`."""
-        factory_correction = self.correction if correction else None
-        images = [
-            rendered.frame
-            if factory_correction is None
-            else _corrected(factory_correction, rendered.frame)
-            for rendered in self.frames(progress)
-        ]
-        source = ArraySource(images, self.poses, metadata=_metadata(self, correction))
+        images = (
+            [*self.corrected_frames(progress)]
+            if correction
+            else [rendered.frame for rendered in self.frames(progress)]
+        )
+        known = {name: value for name, value in self.facts.items() if value is not None}
+        source = ArraySource(images, self.poses, metadata=known | {"corrected": correction})
         return Recording.of(source, f"simulated {self.scene.name}", "simulated")
+
+
+def corrected(frame: RangeFrame, correction: DepthCorrection) -> RangeFrame:
+    """Return a frame with the depth that a factory correction gives."""
+    depth = corrected_depth(correction, frame.camera, frame.depth, frame.depth_kind)
+    return replace(frame, depth=depth)
 
 
 def plan(
@@ -130,63 +155,50 @@ def plan(
     return RecordingPlan(built, sequence, model, effects, seed, raw)
 
 
+class PlanOptions(TypedDict, total=False):
+    """The options of `plan`."""
+
+    camera: str
+    seed: int
+    effects: Effects
+    every: int | None
+    frames: int | None
+    first: int
+    texture: bool
+    passing: Passing | None
+    mirror: tuple[float, float] | None
+
+
 def simulate_recording(
     scene: str,
     *,
-    camera: str = "sr4000",
-    seed: int = 0,
-    effects: Effects = _DEFAULT,
-    every: int | None = None,
-    frames: int | None = None,
-    first: int = 0,
     correction: bool = True,
-    texture: bool = True,
-    passing: Passing | None = None,
-    mirror: tuple[float, float] | None = None,
     sigma_m: float = 0.05,
     progress: Progress | None = None,
+    **options: Unpack[PlanOptions],
 ) -> Recording:
     """Simulate a recording in memory, equal to one read from the output of `simulate`.
 
     The true poses are its reference. See `simulate` for the parameters.
     """
-    if scene == "peaks":
-        views, poses = peaks_views(sigma_m, seed)
-        selection = slice(None, frames and frames * (every or 1), every)
-        selected = [replace(view, index=k) for k, view in enumerate(views[selection])]
-        return Recording.of(ArraySource(selected, poses[selection]), "simulated peaks", "simulated")
-    planned = plan(
-        scene,
-        camera=camera,
-        seed=seed,
-        effects=effects,
-        every=every,
-        frames=frames,
-        first=first,
-        texture=texture,
-        passing=passing,
-        mirror=mirror,
-    )
-    return planned.recording(correction=correction, progress=progress)
+    if scene != "peaks":
+        return plan(scene, **options).recording(correction=correction, progress=progress)
+    views, poses = peaks_views(sigma_m, options.get("seed", 0))
+    every, frames = options.get("every"), options.get("frames")
+    selection = slice(None, frames and frames * (every or 1), every)
+    selected = [replace(view, index=k) for k, view in enumerate(views[selection])]
+    return Recording.of(ArraySource(selected, poses[selection]), "simulated peaks", "simulated")
 
 
 def simulate(
     scene: str,
     out: str | Path,
     *,
-    camera: str = "sr4000",
-    seed: int = 0,
-    effects: Effects = _DEFAULT,
-    every: int | None = None,
-    frames: int | None = None,
-    first: int = 0,
     correction: bool = True,
-    texture: bool = True,
-    passing: Passing | None = None,
-    mirror: tuple[float, float] | None = None,
     imu: bool = False,
     sigma_m: float = 0.05,
     progress: Progress | None = None,
+    **options: Unpack[PlanOptions],
 ) -> Path:
     """Simulate a recording as a native folder, with the truth in groundtruth.txt and truth/.
 
@@ -236,20 +248,8 @@ def simulate(
         If the folder can't be written or isn't empty.
     """
     if scene == "peaks":
-        return _write_peaks(Path(out), seed, sigma_m, every, frames)
-    planned = plan(
-        scene,
-        camera=camera,
-        seed=seed,
-        effects=effects,
-        every=every,
-        frames=frames,
-        first=first,
-        texture=texture,
-        passing=passing,
-        mirror=mirror,
-    )
-    return write(planned, out, correction=correction, imu=imu, progress=progress)
+        return _write_peaks(Path(out), simulate_recording(scene, sigma_m=sigma_m, **options))
+    return write(plan(scene, **options), out, correction=correction, imu=imu, progress=progress)
 
 
 def write(
@@ -262,16 +262,7 @@ def write(
 ) -> Path:
     """Render a planned recording and write it as a native folder; see `simulate`."""
     model, effects, seed = planned.model, planned.effects, planned.seed
-    writer = RecordingWriter(
-        out,
-        model.camera,
-        depth_unit_m=model.depth_unit_m,
-        depth_kind=model.depth_kind,
-        frame_rate_hz=planned.sequence.frame_rate_hz,
-        ambiguity_m=model.ambiguity_m,
-        confidence_max=model.confidence_max,
-        amplitude_kind=model.amplitude_kind,
-    )
+    writer = RecordingWriter(out, model.camera, **planned.facts)
     truth = writer.folder / "truth"
     flags, depths = atomic.make_folder(truth / "flags"), atomic.make_folder(truth / "depth")
     for k, rendered in enumerate(planned.frames(progress)):
@@ -292,10 +283,7 @@ def write(
     )
 
 
-def _write_peaks(
-    out: Path, seed: int, sigma_m: float, every: int | None, frames: int | None
-) -> Path:
-    recording = simulate_recording("peaks", seed=seed, sigma_m=sigma_m, every=every, frames=frames)
+def _write_peaks(out: Path, recording: Recording) -> Path:
     writer = RecordingWriter(out, None)
     for frame in recording:
         writer.add(frame)
@@ -303,22 +291,3 @@ def _write_peaks(
     truth = atomic.make_folder(writer.folder / "truth")
     write_ply(truth / "surface.ply", GeometryRecord(se3.transform(T_camera_object, peaks_points())))
     return writer.finish(groundtruth=recording.reference)
-
-
-def _corrected(correction: DepthCorrection, frame: RangeFrame) -> RangeFrame:
-    depth = corrected_depth(correction, frame.camera, frame.depth, frame.depth_kind)
-    return replace(frame, depth=depth)
-
-
-def _metadata(planned: RecordingPlan, correction: bool) -> dict[str, object]:
-    model = planned.model
-    metadata = {
-        "frame_rate_hz": planned.sequence.frame_rate_hz,
-        "ambiguity_m": model.ambiguity_m,
-        "confidence_max": model.confidence_max,
-        "amplitude_kind": model.amplitude_kind,
-        "depth_unit_m": model.depth_unit_m,
-        "depth_kind": model.depth_kind,
-        "corrected": correction,
-    }
-    return {key: value for key, value in metadata.items() if value is not None}

@@ -11,7 +11,6 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.frames import ArraySource, RangeFrame, Recording
 from tofuse.engine.geometry import se3
-from tofuse.formats.cameras import corrected_depth
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import CameraModel, camera_model
 from tofuse.lab.simulation.record import RecordingPlan
@@ -104,31 +103,21 @@ def simulate_rig(
         first = int(np.ceil(first_own_s * mount.frame_rate_hz - 1e-9))
         raw = first + np.arange(frames)
         planned = RecordingPlan(scene, camera_sequence, mount.model, effects, 1000 * seed + k, raw)
-        images = [
-            _apply_camera_errors(planned, mount, rendered.frame)
-            for rendered in planned.frames(None)
-        ]
-        source = ArraySource(
-            images,
-            planned.poses,
-            metadata={
-                "frame_rate_hz": mount.frame_rate_hz,
-                "ambiguity_m": mount.model.ambiguity_m,
-                "amplitude_kind": mount.model.amplitude_kind,
-                "depth_kind": mount.model.depth_kind,
-            },
-        )
+        images = [_biased(frame, mount.depth_offset_m) for frame in planned.corrected_frames()]
+        names = ("frame_rate_hz", "ambiguity_m", "amplitude_kind", "depth_kind")
+        metadata = {name: planned.facts[name] for name in names}
+        source = ArraySource(images, planned.poses, metadata=metadata)
         recordings.append(Recording.of(source, f"simulated camera {k}", "simulated"))
     return recordings
 
 
-def _apply_camera_errors(planned: RecordingPlan, mount: Mount, frame: RangeFrame) -> RangeFrame:
-    """Apply the factory correction to an image, and add this camera's bias."""
-    depth = corrected_depth(planned.correction, frame.camera, frame.depth, frame.depth_kind)
-    if mount.depth_offset_m:
-        scale = 1.0 if frame.depth_kind == "range" else 1.0 / ray_lengths(frame.camera)
-        depth = np.where(depth > 0, depth + mount.depth_offset_m * scale, 0).astype(np.float32)
-    return replace(frame, depth=depth)
+def _biased(frame: RangeFrame, offset_m: float) -> RangeFrame:
+    """Return an image with a bias of its ranges."""
+    if not offset_m:
+        return frame
+    scale = 1.0 if frame.depth_kind == "range" else 1.0 / ray_lengths(frame.camera)
+    biased = np.where(frame.depth > 0, frame.depth + offset_m * scale, 0)
+    return replace(frame, depth=biased.astype(np.float32))
 
 
 def wander(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64, Int64
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, triangles
 
 # Crease angle: edges below it are smoothed.
 CREASE_RAD = np.deg2rad(48.0)
@@ -73,8 +73,7 @@ def joined(meshes: Sequence[Mesh]) -> Mesh:
 
 def face_normals(mesh: Mesh) -> Float64:
     """(F, 3) unit normals; zero for a triangle without area."""
-    c = mesh.corners()
-    n = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
+    n = triangles.crosses(mesh.corners())
     length = np.linalg.norm(n, axis=1, keepdims=True)
     return n / np.where(length > 0, length, 1.0)
 
@@ -86,8 +85,7 @@ def corner_normals(mesh: Mesh, crease_rad: float = CREASE_RAD) -> Float64:
     normals are within the crease angle of its own.
     """
     normals = face_normals(mesh)
-    c = mesh.corners()
-    area = 0.5 * np.linalg.norm(np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]), axis=1)
+    area = triangles.areas(mesh.corners())
     vertex = mesh.faces.ravel()
     order = np.argsort(vertex, kind="stable")
     count = np.bincount(vertex, minlength=len(mesh.vertices))
