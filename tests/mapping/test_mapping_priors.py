@@ -25,7 +25,7 @@ from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import device_up, reconstruct
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.results.types import FrameRecord
-from tofuse.engine.tracking.rival_motions import RivalMotions
+from tofuse.engine.tracking.rival_motions import RivalMotions, Rivalry
 from tofuse.formats.recordings.open import open_recording
 
 # Only the poses matter: the model is coarse.
@@ -177,7 +177,7 @@ def drifting(right: Float64) -> Float64:
 
 def test_device_poses_decide_what_stands_still(monkeypatch) -> None:
     """Errors of an alignment may look like another motion, which a phone's poses refute."""
-    monkeypatch.setattr(RivalMotions, "compare", lambda *_: (0.9, ""))
+    monkeypatch.setattr(RivalMotions, "compare", lambda *_: Rivalry(0.9))
     recording = past_a_corner().select(end=14)
     phone = by_phone(recording, drifting(recording.reference))
     accuracies = {}
