@@ -12,6 +12,7 @@ import pytest
 import tofuse
 from ray_casting import rays_at, to_plane
 from report_results import lonely
+from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
@@ -25,6 +26,7 @@ from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import device_up, reconstruct
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.results.types import FrameRecord
+from tofuse.engine.tracking.rival_motions import RivalMotions, Rivalry
 from tofuse.formats.recordings.open import open_recording
 
 # Only the poses matter: the model is coarse.
@@ -162,6 +164,29 @@ def past_a_corner(covered: Collection[int] = ()) -> Recording:
     return Recording.of(ArraySource(frames, poses, metadata={}), "simulated", "native")
 
 
+def drifting(right: Float64) -> Float64:
+    """Poses (N, 4, 4) as a phone estimates them."""
+    rng = np.random.default_rng(1)
+    phone = [right[0]]
+    for step in se3.inverse(right[:-1]) @ right[1:]:
+        phone.append(phone[-1] @ step @ se3.exp(0.001 * rng.standard_normal(6)))
+    return np.array(phone)
+
+
+def test_device_poses_decide_what_stands_still(monkeypatch) -> None:
+    """Errors of an alignment may look like another motion, which a phone's poses refute."""
+    monkeypatch.setattr(RivalMotions, "compare", lambda *_: Rivalry(0.9))
+    recording = past_a_corner().select(end=14)
+    phone = by_phone(recording, drifting(recording.reference))
+    accuracies = {}
+    for prior in ("auto", "none"):
+        found = tofuse.reconstruct(phone, COARSE, prior=prior).diagnostics
+        assert ("open_motion" in [r.code for r in found.reasons]) == (prior == "none")
+        accuracies[prior] = found.accuracy.position_m
+    assert np.isfinite(accuracies["auto"])
+    assert not np.isfinite(accuracies["none"])
+
+
 @pytest.mark.nightly
 @pytest.mark.parametrize("covered", [(), range(22, 32)])
 def test_device_poses_bound_slide_along_wall(covered) -> None:
@@ -171,11 +196,7 @@ def test_device_poses_bound_slide_along_wall(covered) -> None:
     alone = reconstruct(recording, COARSE)
     slide = alone.diagnostics.accuracy.unbounded
     assert len(slide) > 5
-    rng = np.random.default_rng(1)
-    phone = [right[0]]
-    for step in se3.inverse(right[:-1]) @ right[1:]:
-        phone.append(phone[-1] @ step @ se3.exp(0.001 * rng.standard_normal(6)))
-    result = reconstruct(*with_prior(by_phone(recording, phone), COARSE, "auto"))
+    result = reconstruct(*with_prior(by_phone(recording, drifting(right)), COARSE, "auto"))
     accuracy = result.diagnostics.accuracy
     assert accuracy.unbounded == ()
     assert set(accuracy.by_odometry) >= set(slide[3:])

@@ -134,6 +134,16 @@ ORDER = [
 ]
 
 
+def test_model_is_shown_alone_at_first(shown):
+    checked = {
+        n
+        for n, on in re.findall(r'type="checkbox" name="(\w+)"[^>]*?( checked)?>', shown.text)
+        if on
+    }
+    assert checked & {"mesh", "points"}
+    assert not checked & {"after", "before", "reference", "loops"}
+
+
 def test_sections_are_ordered_with_model_first(shown):
     assert list(shown.sections) == [name for name in ORDER if name != "recording"]
     text = " ".join(shown.sections["verdict"].split())

@@ -277,6 +277,19 @@ def test_rival_motion_leaves_the_choice_open() -> None:
     assert not judge(replace(evidence(), rivals=((3, 0.2),)))[1]
 
 
+def test_jump_that_another_sensor_measured_is_expected() -> None:
+    jumps = evidence(steps=[(0.05 * k + 0.4 * (k > 4), 0, 0, 0, 0, 0) for k in range(9)])
+    assert codes(jumps) == ["jumped"]
+    assert codes(replace(jumps, measured=frozenset({5}))) == []
+
+
+def test_motion_that_another_sensor_measured_is_not_open() -> None:
+    largest = replace(evidence(), rivals=((3, 0.9), (5, 0.4)), measured=frozenset({3}))
+    (reason,) = judge(largest)[1]
+    assert (reason.code, reason.frames) == ("open_motion", (5, 5))
+    assert "40 %" in reason.text
+
+
 def test_frozen_images_are_told_from_single_repetitions() -> None:
     assert checks.frozen(((3, 3), (6, 8)))
     assert not checks.frozen(((3, 3), (5, 5)))

@@ -9,7 +9,7 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.tracking.keyframes import Keyframes
-from tofuse.engine.tracking.rival_motions import RivalMotions
+from tofuse.engine.tracking.rival_motions import RivalMotions, Rivalry
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
 
@@ -39,7 +39,7 @@ def image(index: int, columns: int, shift: int = 0) -> RangeFrame:
     return RangeFrame(index, index / 15, CAMERA, depth.astype(np.float32))
 
 
-def compared(columns: int, T: np.ndarray, rivals: dict[str, np.ndarray]) -> tuple[float, str]:
+def compared(columns: int, T: np.ndarray, rivals: dict[str, np.ndarray]) -> Rivalry:
     """Compare a tracked motion with its rivals, where the near surface moved in between."""
     before = prepare_view(image(0, columns), SurfaceOptions())
     now = prepare_view(image(2, columns, SHIFT), SurfaceOptions())
@@ -50,25 +50,34 @@ WITH_NEAR = se3.translation((-SHIFT * NEAR_M / FOCAL, 0.0, 0.0))
 
 
 def test_camera_that_follows_near_surface_is_noticed() -> None:
-    share, winner = compared(110, WITH_NEAR, {"stands": np.eye(4)})
+    share, winner, rest = compared(110, WITH_NEAR, {"stands": np.eye(4)})
     assert share > 0.5
     assert winner == "stands"
+    assert 0.25 < rest < 0.75  # the near surface is larger in the image, and still is open
 
 
 def test_near_surface_does_not_win_by_its_size() -> None:
-    share, winner = compared(110, np.eye(4), {"goes on": WITH_NEAR})
+    share, winner, _ = compared(110, np.eye(4), {"goes on": WITH_NEAR})
     assert share > 0.25
     assert winner == ""
 
 
 def test_small_near_surface_leaves_nothing_open() -> None:
-    share, winner = compared(16, np.eye(4), {"goes on": WITH_NEAR})
+    share, winner, _ = compared(16, np.eye(4), {"goes on": WITH_NEAR})
     assert share < 0.25
     assert winner == ""
 
 
 def test_equal_motions_are_no_rivals() -> None:
-    assert compared(110, np.eye(4), {"stands": np.eye(4)}) == (0.0, "")
+    assert compared(110, np.eye(4), {"stands": np.eye(4)}) == Rivalry(0.0)
+
+
+def test_rival_that_everything_follows_leaves_nothing_open() -> None:
+    """The tracked motion was wrong, and nothing else moves."""
+    share, winner, rest = compared(0, WITH_NEAR, {"stands": np.eye(4)})
+    assert share > 0.9
+    assert winner == "stands"
+    assert rest < 0.1
 
 
 @pytest.mark.parametrize("columns", [80, 120])
@@ -81,3 +90,11 @@ def test_somebody_near_does_not_take_the_camera_along(columns: int) -> None:
     assert {step.component for step in steps} == {0}
     for step in steps:
         assert np.linalg.norm(step.T_component_camera[:3, 3]) < 0.02
+
+
+@pytest.mark.parametrize(("winner", "left"), [("stands", 0.1), ("", 0.9)])
+def test_adopted_rival_leaves_open_what_does_not_follow_it(monkeypatch, winner, left) -> None:
+    monkeypatch.setattr(RivalMotions, "compare", lambda *_: Rivalry(0.9, winner, 0.1))
+    tracker = Keyframes().start(0)
+    steps = [tracker.push(image(k, 0)) for k in range(2)]
+    assert steps[1].rival == left

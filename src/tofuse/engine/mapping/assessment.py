@@ -118,7 +118,9 @@ class Assessment:
         indices = [e.record.index for e in self.log.entries]
         repeated = frame_ranges.runs_of(indices, self.log.repeated)
         changes = refined.refinement.range_change is not None
-        is_open = changes or checks.open_motion([*moving, *rivals])
+        sensors = closed.sensors
+        measured = frozenset(s.j for s in sensors.steps) if sensors.verified else frozenset[int]()
+        is_open = changes or checks.open_motion([*moving, *rivals], measured)
         if ambiguous or is_open or checks.frozen(repeated):
             accuracy = accuracy.without_bound()
         if observations.has_covariances:
@@ -152,6 +154,7 @@ class Assessment:
             moving=moving,
             moved=moved,
             rivals=rivals,
+            measured=measured,
             doubtful=tuple(e.record.index for e in posed if e.step is not None and e.step.doubtful),
             single_link_frames=single_link_frames(self.tracked, loops),
             ambiguous=ambiguous,

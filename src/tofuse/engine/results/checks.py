@@ -110,6 +110,8 @@ class Evidence:
         Indices of the frames in which something certainly moved.
     rivals
         (frame index, share of the view) of frames of which a share follows a rival motion.
+    measured
+        Indices of the frames whose motion verified odometry measured, and agrees with.
     doubtful
         Indices of the frames that fit worse than usual for this camera.
     single_link_frames
@@ -140,6 +142,7 @@ class Evidence:
     moving: tuple[tuple[int, float], ...] = ()
     moved: tuple[int, ...] = ()
     rivals: tuple[tuple[int, float], ...] = ()
+    measured: frozenset[int] = frozenset()
     doubtful: tuple[int, ...] = ()
     single_link_frames: tuple[int, ...] = ()
     ambiguous: tuple[int, ...] = ()
@@ -275,7 +278,11 @@ def _motion(e: Evidence) -> Iterator[Reason]:
     moments = [FrameTime(r.index, r.timestamp) for r in e.records]
     unmeasured = {k + 1 for k, record in enumerate(e.records) if len(record.unobservable)}
     unexpected = {*e.interruptions, *_component_changes(e.records, has_pose), *unmeasured}
-    pose_jumps = find_jumps(poses, moments, unexpected)
+    pose_jumps = [
+        jump
+        for jump in find_jumps(poses, moments, unexpected)
+        if e.records[jump[0]].index not in e.measured
+    ]
     frames = [e.records[k].index for k, _ in pose_jumps]
     if len(pose_jumps) > max(MIN_UNORDERED, UNORDERED_FRACTION * sum(has_pose)):
         text = (
@@ -434,12 +441,13 @@ def _scene(e: Evidence) -> Iterator[Reason]:
             text = words.format(_percent(largest), frame_ranges.in_words(where))
             yield Reason(code, where, f"{text} excluded from tracking and from the model.")
     parts = [*e.moving, *e.rivals]
-    if where := e.runs_of(open_motion(parts)):
+    if frames := open_motion(parts, e.measured):
+        where = e.runs_of(frames)
+        largest = max(share for frame, share in parts if frame in frames)
         text = (
             f"Two parts of the view move differently in {frame_ranges.in_words(where)}, and either "
             f"may be the room: the one that the camera was not tracked by has up to "
-            f"{_percent(max(share for _, share in parts))}. So no bound on the pose errors is "
-            "stated."
+            f"{_percent(largest)}. So no bound on the pose errors is stated."
         )
         yield Reason("open_motion", where, text)
     doubtful = e.runs_of(e.doubtful)
@@ -453,9 +461,12 @@ def _scene(e: Evidence) -> Iterator[Reason]:
         yield Reason("doubtful_poses", doubtful, f"{_sentence(doubtful)} {description}")
 
 
-def open_motion(moving: Sequence[tuple[int, float]]) -> set[int]:
-    """Return the frames in which what moves, (frame index, share of the view), is too much."""
-    return {frame for frame, fraction in moving if fraction > MAX_MOVING}
+def open_motion(moving: Sequence[tuple[int, float]], measured: Collection[int] = ()) -> set[int]:
+    """Return the frames in which what moves, (frame index, share of the view), is too much.
+
+    Nothing is open in frames whose motion another sensor measured, and agrees with.
+    """
+    return {frame for frame, fraction in moving if fraction > MAX_MOVING and frame not in measured}
 
 
 def frozen(repeated: Sequence[frame_ranges.Range]) -> bool:

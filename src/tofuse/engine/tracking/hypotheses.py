@@ -297,7 +297,7 @@ class Hypotheses:
 
         Returns
         -------
-        The hypothesis and its segmentation, and the share of the view that follows a rival.
+        The hypothesis and its segmentation, and the share of the view that follows another motion.
         """
         keyframe, state = accepted.keyframe, self.state
         if state.is_static:
@@ -310,7 +310,7 @@ class Hypotheses:
         if self.T_predicted is not None:
             T_rivals["goes on"] = self.T_predicted
         to_keyframe = se3.inverse(keyframe.T_component_camera)
-        share, winner = state.rivals.compare(
+        share, winner, rest = state.rivals.compare(
             self.view,
             keyframe.view,
             accepted.T_keyframe_camera,
@@ -335,7 +335,7 @@ class Hypotheses:
         state.objects.update(with_objects)
         state.rivals.reset()
         state.motion.rest_at(static.T_component_camera, self.now)
-        return static, with_objects, share
+        return static, with_objects, rest
 
     def _make_references(self) -> list[Reference]:
         """Return the newest keyframe and the last frame, without moved objects."""

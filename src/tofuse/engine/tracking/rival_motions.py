@@ -17,6 +17,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -53,6 +54,24 @@ _ITERATIONS = 50
 _MIN_PART = 0.125
 
 
+class Rivalry(NamedTuple):
+    """What follows other motions than the tracked one.
+
+    Attributes
+    ----------
+    share
+        Largest share of the view that follows a rival.
+    winner
+        Name of the rival that most of the surface follows, or "".
+    rest
+        Share that does not follow the winner: that of the tracked motion if the winner is adopted.
+    """
+
+    share: float
+    winner: str = ""
+    rest: float = 0.0
+
+
 class RivalMotions:
     """Compares the tracked motion with its rivals, from frame to frame."""
 
@@ -72,11 +91,10 @@ class RivalMotions:
         T_reference_view: Float64,
         rivals: Mapping[str, Float64],
         scale: float,
-    ) -> tuple[float, str]:
+    ) -> Rivalry:
         """Compare a view if it is one of every second, and judge the last ones.
 
-        Returns the largest share that follows a rival, and the name of the rival that most of the
-        surface follows, or "". A rival that is not given is not judged.
+        A rival that is not given is not judged.
 
         Parameters
         ----------
@@ -91,17 +109,17 @@ class RivalMotions:
         """
         self._views += 1
         if self._views % _EVERY != 1:
-            return self._share, ""
-        self._share, winner = 0.0, ""
+            return Rivalry(self._share)
+        self._share, winner, rest = 0.0, "", 0.0
         tracked = _Tracked(view, reference, T_reference_view, scale)
         for name, T in rivals.items():
             window = self._windows.setdefault(name, deque(maxlen=_WINDOW))
             window.append(tracked.histograms(T))
             of_cells, of_area = (_share(weights) for weights in np.sum(window, axis=0))
             self._share = max(self._share, of_cells, of_area)
-            if of_area > 0.5 and window[-1].any():
-                winner = winner or name
-        return self._share, winner
+            if not winner and of_area > 0.5 and window[-1].any():
+                winner, rest = name, 1 - min(of_cells, of_area)
+        return Rivalry(self._share, winner, rest)
 
 
 @dataclass(frozen=True, eq=False)
