@@ -12,12 +12,7 @@ from scipy.special import bdtrc
 
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Bool, Float64, Intp
-from tofuse.engine.color.color_views import (
-    ColorView,
-    Search,
-    homogeneous,
-    matched,
-)
+from tofuse.engine.color.color_views import ColorView, Search, homogeneous, matched
 from tofuse.engine.compute import run_all
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3

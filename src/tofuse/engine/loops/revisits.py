@@ -18,12 +18,7 @@ from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import LoopRecord
 from tofuse.engine.loops.appearance import Appearance
-from tofuse.engine.loops.candidates import (
-    MAX_OVERLAP_BETWEEN,
-    CandidateSelector,
-    LoopView,
-    Pair,
-)
+from tofuse.engine.loops.candidates import MAX_OVERLAP_BETWEEN, CandidateSelector, LoopView, Pair
 from tofuse.engine.loops.loops import (
     ClosedLoop,
     LoopDetector,

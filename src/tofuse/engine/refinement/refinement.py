@@ -19,13 +19,7 @@ from tofuse.engine.refinement.calibration_check import (
     check_calibration,
     combine_checks,
 )
-from tofuse.engine.refinement.joint_alignment import (
-    MAX_LOSS,
-    Priors,
-    Refined,
-    refine,
-    support_fell,
-)
+from tofuse.engine.refinement.joint_alignment import MAX_LOSS, Priors, Refined, refine, support_fell
 from tofuse.engine.refinement.loop_drift import loop_gap
 from tofuse.engine.refinement.range_change import RangeChange
 from tofuse.engine.refinement.split_half import rms_motion, split_half_errors

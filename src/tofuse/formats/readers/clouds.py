@@ -16,12 +16,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
 from tofuse.formats.geometry import Pcd, read_pcd
-from tofuse.formats.sources import (
-    cloud_frames,
-    cloud_sequence,
-    inputs,
-    organised,
-)
+from tofuse.formats.sources import cloud_frames, cloud_sequence, inputs, organised
 
 
 @part("reader", "ply", label="validated")

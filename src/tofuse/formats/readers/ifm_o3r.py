@@ -21,14 +21,7 @@ from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
-from tofuse.formats.sources import (
-    FileSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    inputs,
-    pixels,
-)
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, pixels
 
 DISTANCE, AMPLITUDE, NOISE, CONFIDENCE, INFO = 100, 101, 105, 300, 420
 _IMAGES = {"flags": CONFIDENCE, "noise": NOISE, "amplitude": AMPLITUDE}

@@ -16,14 +16,7 @@ from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import npz, reading
-from tofuse.formats.sources import (
-    FileSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    inputs,
-    pixels,
-)
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, pixels
 
 MAX_BYTES = 1 << 30
 _IMAGES = {"amplitude": 3, "confidence": 3, "sigma": 3, "color": 4}

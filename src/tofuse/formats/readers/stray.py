@@ -13,14 +13,7 @@ from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading, tables
 from tofuse.formats.images import Video, first_size
-from tofuse.formats.sources import (
-    Reader,
-    ReaderOptions,
-    Sniff,
-    gravity_at,
-    inputs,
-    phones,
-)
+from tofuse.formats.sources import Reader, ReaderOptions, Sniff, gravity_at, inputs, phones
 
 FRAME_RATE_HZ = 60.0
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
