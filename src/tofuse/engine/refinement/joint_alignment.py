@@ -10,7 +10,7 @@ the same system.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -141,6 +141,17 @@ class Refined:
     measured: Float64
     information: Float64
     scales: pair_equations.KnownScales
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedViews:
+    """Views with the result of their joint alignment by `refine`, and with what it was given."""
+
+    views: Sequence[SampledView]
+    refined: Refined
+    options: pair_equations.RefineOptions
+    priors: Priors = field(default_factory=Priors.none)
+    calibrate: Sequence[int] = ()
 
 
 @dataclass(frozen=True, eq=False)

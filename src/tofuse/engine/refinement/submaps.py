@@ -21,6 +21,7 @@ from tofuse.engine.graph import PoseGraph, levenberg
 from tofuse.engine.refinement.joint_alignment import (
     Priors,
     Refined,
+    RefinedViews,
     Support,
     refine,
     spread_evenly,
@@ -57,15 +58,6 @@ class Submap:
 
     views: Intp
     pairs: Intp
-
-
-@dataclass(frozen=True, eq=False)
-class RefinedSubmap:
-    """A refined submap: its views, the result, and the priors."""
-
-    views: Sequence[SampledView]
-    refined: Refined
-    priors: Priors
 
 
 def partition(places: Float64, max_size: int) -> Intp:
@@ -123,8 +115,8 @@ def refine_submaps(
     max_size: int,
     load: Callable[[Intp], list[SampledView]],
     priors: Callable[[Intp | None], Priors],
-    evaluate: Callable[[RefinedSubmap], A],
-    calibrate: Sequence[int] = (),
+    evaluate: Callable[[RefinedViews], A],
+    calibrate: Sequence[int],
 ) -> tuple[Refined, list[A]]:
     """Refine all views submap by submap, see `refine`; also returns `evaluate` of each submap.
 
@@ -205,13 +197,13 @@ def _refine_submap(
     options: pair_equations.RefineOptions,
     calibrate: Sequence[int],
     priors: Priors,
-    evaluate: Callable[[RefinedSubmap], A],
+    evaluate: Callable[[RefinedViews], A],
 ) -> tuple[Refined, A]:
     """Refine one submap separately, from poses (N, 4, 4), and evaluate it."""
     local = np.searchsorted(part.views, part.pairs)
     start = se3.inverse(poses[0]) @ poses
     refined = refine(views, start, options, calibrate=calibrate, priors=priors, pairs=local)
-    evaluation = evaluate(RefinedSubmap(views, refined, priors))
+    evaluation = evaluate(RefinedViews(views, refined, options, priors, calibrate))
     return _or_unchanged(refined, start), evaluation
 
 
