@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 import threading
 import weakref
@@ -270,8 +269,7 @@ _REQUIRED = (
     "intrinsicCalibModelParameters",
 )
 _FIELDS = {"flags": "confidence", "noise": "distanceNoise", "amplitude": "amplitude"}
-_MAX_FRAMES, _MAX_ROW_BYTES = 1_000_000, 1 << 26  # per file, and per frame
-_LENS_PARAMETERS = 10
+_MAX_FRAMES, _MAX_ROW_BYTES = 1 << 20, 1 << 26  # per file, and per frame
 
 
 @part("reader", "ifm-h5", label="experimental")
@@ -358,7 +356,7 @@ class IfmH5Source(FileSource):
         counts = self._image(row, "distance")
         stored = np.asarray(row["intrinsicCalibModelParameters"], float).ravel()
         unit, model = float(row["distanceResolution"]), int(row["intrinsicCalibModelID"])
-        parameters = tuple(stored[:_LENS_PARAMETERS].tolist())
+        parameters = tuple(stored[:_PARAMETERS].tolist())
         info = checked_info(unit, model, parameters, self.where(index))
         images = {
             name: self._image(row, field, counts.shape)
@@ -381,7 +379,6 @@ BEGIN, END = b"star", b"stop"
 _HEAD = 36
 _TYPES = ("u1", "i1", "<u2", "<i2", "<u4", "<i4", "<f4", "<u8", "<f8")
 _MAX_SIDE = 8192
-_MAX_FRAMES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -395,7 +392,6 @@ class Chunk:
     time_us: int
     seconds: int
     nanoseconds: int
-    metadata: dict[str, Any]
     start: int
     end: int
 
@@ -440,11 +436,8 @@ def _chunks(data: bytes, offset: int, where: str) -> tuple[dict[int, Chunk], int
         if not _HEAD <= header_size <= size or offset + size > len(data):
             raise InputError(f"is cut off or damaged in chunk {kind}", where=where)
         seconds = nanoseconds = 0
-        metadata: dict[str, Any] = {}
         if version >= 2 and header_size >= 48:
             seconds, nanoseconds = struct.unpack_from("<2I", data, offset + 40)
-        if version >= 3 and header_size > 48:
-            metadata = _json(data[offset + 48 : offset + header_size])
         chunks[kind] = Chunk(
             kind,
             width,
@@ -453,20 +446,11 @@ def _chunks(data: bytes, offset: int, where: str) -> tuple[dict[int, Chunk], int
             time_us,
             seconds,
             nanoseconds,
-            metadata,
             offset + header_size,
             offset + size,
         )
         offset += size
     return chunks, offset + 4
-
-
-def _json(data: bytes) -> dict[str, Any]:
-    try:
-        metadata = json.loads(data.split(b"\0", 1)[0])
-    except (ValueError, RecursionError):
-        return {}
-    return metadata if isinstance(metadata, dict) else {}
 
 
 def chunk_image(data: bytes, chunk: Chunk, where: str) -> NDArray[Any]:

@@ -88,7 +88,7 @@ class RosSource(bags.BagSource):
             )
 
     def where(self, index: int) -> str:
-        """See `BagSource.where`."""
+        """See `FileSource.where`."""
         return f"{self.path}: {self.connection.topic}, message {index}"
 
     def read_frame(self, index: int, where: str) -> Frame:
