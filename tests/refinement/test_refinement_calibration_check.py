@@ -177,7 +177,7 @@ def test_support_of_an_estimate_is_that_of_the_joint_alignment() -> None:
     joint = refine(views, refined.poses, options, **known)
     aligned = align_views(views, refined.poses, options, **known)
     expected = [float(s.of_views(len(views)).mean()) for s in (joint.before, joint.after)]
-    before, after = mean_support(views, aligned, refined.poses, options)
+    before, after = mean_support(aligned, refined.poses)
     # By the same kernel: that for known errors is exact to first order only.
     assert after == pytest.approx(expected[1], rel=1e-9)
     assert before == pytest.approx(expected[0], abs=1e-3)

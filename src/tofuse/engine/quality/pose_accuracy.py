@@ -288,7 +288,7 @@ def degenerate_directions(
 
     def align_again(k: int) -> None:
         i, j = (views[int(graph.ids[end])].view.without_caches() for end in graph.edges[k])
-        target = [projective.Target(i, np.eye(4))]
+        target = [projective.Target(i)]
         realigned = projective.align(j, target, graph.measurements[k], _ALIGNMENT).unobservable
         # Directions are known to a few degrees only, and the remainder would look measured: a
         # degenerate pair is taken to be degenerate in all directions of its views.

@@ -75,7 +75,7 @@ def measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> 
     ids = [view.index for view in views]
 
     def measured(i: int, j: int) -> tuple[Measured, Float64]:
-        target = [projective.Target(surfaces[i], np.eye(4))]
+        target = [projective.Target(surfaces[i])]
         T_i_j = se3.inverse(poses[i]) @ poses[j]
         aligned = projective.align(surfaces[j], target, T_i_j, _ALIGNMENT)
         C = covariance(surfaces[j], target, aligned, _ALIGNMENT)

@@ -381,7 +381,7 @@ class _Estimator:
 
     def support_of(self, estimate: AlignedViews) -> tuple[float, float]:
         """Mean support of the views without and with the errors of an estimate."""
-        return mean_support(self._views, estimate, self._poses, self._options)
+        return mean_support(estimate, self._poses)
 
 
 def combine_checks(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:

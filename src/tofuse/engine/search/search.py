@@ -261,7 +261,7 @@ class Search:
         source, target = (view.with_falloff(falloff) for view in (self.source, self.target))
         count = self.options.photometric_candidates
         best, remaining = distinct[:count], distinct[count:]
-        targets = [projective.Target(target, np.eye(4))]
+        targets = [projective.Target(target)]
         alignments = run_all(
             [
                 partial(projective.align, source, targets, candidate.T_target_source, _PHOTOMETRIC)

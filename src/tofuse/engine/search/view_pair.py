@@ -226,10 +226,9 @@ class _Pair:
         guess: Float64,
         options: projective.ProjectiveOptions,
     ) -> projective.Aligned:
-        source, target = views
-        return projective.align(
-            source, _as_target(target), guess, options, usual_scale=self.fit_statistics.noise_scale
-        )
+        source, target = views[0], [projective.Target(views[1])]
+        scale = self.fit_statistics.noise_scale
+        return projective.align(source, target, guess, options, usual_scale=scale)
 
     def _consistent_pose(
         self,
@@ -324,14 +323,10 @@ class _Pair:
         wide_prior = replace(
             pose.options, prior_m=_FEW_ITERATIONS.prior_m, prior_rad=_FEW_ITERATIONS.prior_rad
         )
-        source, target = pose.views
-        C = covariance(source, _as_target(target), pose.aligned, wide_prior, self.uncertainty)
+        source, target = pose.views[0], [projective.Target(pose.views[1])]
+        C = covariance(source, target, pose.aligned, wide_prior, self.uncertainty)
         if pose.T_target_source is not pose.aligned.T_world_source:
             # Not aligned: add the residual error of the search.
             options = pose.options
             C = C + np.diag(np.array([options.prior_m] * 3 + [options.prior_rad] * 3) ** 2)
         return C
-
-
-def _as_target(view: PreparedView) -> list[projective.Target]:
-    return [projective.Target(view, np.eye(4))]
