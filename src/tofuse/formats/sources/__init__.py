@@ -1,9 +1,9 @@
 """What readers of formats share: the interface of a `Reader`, and sources of frames to derive from.
 
 A reader detects its format (`Sniff`) and opens a `FileSource`, or one of the more specific sources
-in `bags`, `phones` and `cloud_sequence`. `inputs` finds the files of a recording, and reads what
-belongs to each frame (pose, time, camera); `pixels` and `cloud_frames` make images and clouds, and
-`organised` finds the camera of clouds that were images.
+in `bags`, `phones` and `cloud_files`. `inputs` finds the files of a recording, and reads what
+belongs to each frame (pose, time, camera); `pixels` makes images, and `organised` finds the camera
+of clouds that were images.
 """
 
 from typing import TYPE_CHECKING
@@ -13,8 +13,7 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.formats.sources import (
         bags,
-        cloud_frames,
-        cloud_sequence,
+        cloud_files,
         inputs,
         organised,
         phones,
