@@ -613,9 +613,7 @@ def _rival(views: _CloudViews, poses: Sequence[_Pose], best: _Pose, T: Float64) 
 
 
 def _registration(
-    views: _CloudViews,
-    best: _Pose,
-    poses: Sequence[_Pose] | None = None,
+    views: _CloudViews, best: _Pose, poses: Sequence[_Pose] | None = None
 ) -> Registration:
     """Align all points from the best pose and evaluate its evidence.
 

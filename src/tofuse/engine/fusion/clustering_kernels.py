@@ -81,12 +81,7 @@ def flatten_groups(group: Int32) -> None:
 
 @kernel
 def quadric_sums(
-    vertices: Float32,
-    faces: Int32,
-    group: Int64,
-    centres: Float64,
-    A: Float64,
-    b: Float64,
+    vertices: Float32, faces: Int32, group: Int64, centres: Float64, A: Float64, b: Float64
 ) -> None:
     """Sum the quadrics of the triangles around each group of vertices (Lindstrom 2000).
 

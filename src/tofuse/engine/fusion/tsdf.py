@@ -424,14 +424,7 @@ class Volume:
         """
         net = self._extract(min_views)
         points, normals, intensity, sigma, views = net.vertices
-        return Mesh(
-            points.astype(np.float32),
-            net.faces,
-            normals,
-            to_rgb(intensity),
-            sigma,
-            views,
-        )
+        return Mesh(points.astype(np.float32), net.faces, normals, to_rgb(intensity), sigma, views)
 
     def piece(self, min_views: int = 1) -> Piece:
         """Return the surface of the owned blocks, to be stitched to those of other regions."""
@@ -490,11 +483,7 @@ class Volume:
         return _SurfaceNet(vertices, faces, per_block, cells)
 
     def _faces(
-        self,
-        neighbours: Int32,
-        cells: Int32,
-        starts: Int64,
-        points: Float64,
+        self, neighbours: Int32, cells: Int32, starts: Int64, points: Float64
     ) -> tuple[Int32, Int64]:
         """Return the triangles of the owned blocks, and their number per block."""
         counts = np.zeros(self.owned, np.int64)

@@ -640,18 +640,7 @@ def integrate(
                         centre, offsets[s], lookup, lookup_frame, rows, columns, pixels, points
                     )
                 voxels = slice(64 * octant, 64 * octant + 64)
-                _fetch(
-                    pixels,
-                    heights[s],
-                    codes[s],
-                    weights,
-                    rear_limits,
-                    factor,
-                    code,
-                    d,
-                    w,
-                    rear,
-                )
+                _fetch(pixels, heights[s], codes[s], weights, rear_limits, factor, code, d, w, rear)
                 _point_to_plane(code, points, d)
                 _update_distances(d, w, rear, reach, distance[b, voxels], weight[b, voxels])
                 _count_views(d, reach, view_count[b, voxels])

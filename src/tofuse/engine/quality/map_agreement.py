@@ -251,9 +251,7 @@ def pair_agreement(
 
 
 def consistency_of_images(
-    images: Sequence[SurfaceImage],
-    poses: ArrayLike,
-    pairs: Sequence[tuple[int, int]] | None = None,
+    images: Sequence[SurfaceImage], poses: ArrayLike, pairs: Sequence[tuple[int, int]] | None = None
 ) -> Consistency:
     """Map consistency of prepared views under poses (N, 4, 4) T_world_camera.
 

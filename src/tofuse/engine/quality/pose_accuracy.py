@@ -124,12 +124,7 @@ class Accuracy:
     def without_bound(self) -> Accuracy:
         """Return the accuracy where an error is known that its evidence does not cover."""
         return replace(
-            self,
-            position_m=np.inf,
-            rotation_rad=np.inf,
-            relative=np.inf,
-            worst=None,
-            causes_m={},
+            self, position_m=np.inf, rotation_rad=np.inf, relative=np.inf, worst=None, causes_m={}
         )
 
 
@@ -365,9 +360,7 @@ def contradicted_runs(graph: PoseGraph, frames: Intp, runs: Intp) -> set[int]:
 
 
 def without_degenerate(
-    graph: PoseGraph,
-    directions: Sequence[Float64],
-    unmeasured: Collection[tuple[int, int]] = (),
+    graph: PoseGraph, directions: Sequence[Float64], unmeasured: Collection[tuple[int, int]] = ()
 ) -> PoseGraph:
     """Return the graph without information of its edges along their degenerate directions.
 

@@ -224,11 +224,7 @@ def _unmoved(poses: Float64) -> Aligned:
 
 
 def _level(
-    points: _Points,
-    poses: Float64,
-    size: float,
-    iterations: int,
-    divisions: int = 1,
+    points: _Points, poses: Float64, size: float, iterations: int, divisions: int = 1
 ) -> tuple[Float64, list[_PlaneCells]]:
     """Iterate with cells of one size; returns the poses and their cells.
 

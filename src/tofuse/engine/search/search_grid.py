@@ -168,11 +168,7 @@ def planar_poses(
     ]
     step = depth * max(_PLANAR_STEP, _PLANAR_ANGLE)
     return _best_of_grid(
-        _Scorer(s, t, thinned, step),
-        rotations,
-        translations @ upright_t,
-        _PLANAR_POINTS,
-        count,
+        _Scorer(s, t, thinned, step), rotations, translations @ upright_t, _PLANAR_POINTS, count
     )
 
 

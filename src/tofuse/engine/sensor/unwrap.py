@@ -353,12 +353,7 @@ def _reset_isolated(blocks: _Blocks, best: Intp, period: float, options: UnwrapO
 
 
 def _upsample(
-    radial_range: Float32,
-    blocks: _Blocks,
-    best: Intp,
-    period: float,
-    side: int,
-    max_periods: int,
+    radial_range: Float32, blocks: _Blocks, best: Intp, period: float, side: int, max_periods: int
 ) -> Int32:
     """Return the wrap count (H, W) of pixels: that of the adjacent block closest in range."""
     height, width = radial_range.shape

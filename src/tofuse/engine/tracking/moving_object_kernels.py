@@ -435,11 +435,7 @@ def predict(
 
 @kernel
 def _cell_on_ray(
-    ray: Float32,
-    shape: tuple[int, int],
-    stride: int,
-    lookup: Float32,
-    lookup_frame: Float64,
+    ray: Float32, shape: tuple[int, int], stride: int, lookup: Float32, lookup_frame: Float64
 ) -> tuple[int, int]:
     """Return row and column of the cell that a ray projects to; -1 outside the image."""
     k, m = projection_kernels.nearest_pixel(

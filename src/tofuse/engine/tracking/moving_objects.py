@@ -458,11 +458,7 @@ class MovingObjects:
 
 
 def compared(
-    view: PreparedView,
-    other: PreparedView,
-    other_moving: Bool,
-    T_other_view: Float64,
-    scale: float,
+    view: PreparedView, other: PreparedView, other_moving: Bool, T_other_view: Float64, scale: float
 ) -> tuple[UInt8, Float32]:
     """Return outcomes and log-likelihood ratios of the cells of a view, against another one.
 

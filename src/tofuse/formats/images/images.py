@@ -210,11 +210,7 @@ def _npy_image(path: str | Path, size: tuple[int, int] | None) -> NDArray[Any]:
 
 
 def parse_image(
-    data: bytes,
-    path: str | Path,
-    *,
-    size: tuple[int, int] | None = None,
-    dtype: str | None = None,
+    data: bytes, path: str | Path, *, size: tuple[int, int] | None = None, dtype: str | None = None
 ) -> NDArray[Any]:
     """Decode a PNG, JPEG or PGM in memory; `path` names it in errors. See `read_image`."""
     with reading.about(path, _COPY_AGAIN):

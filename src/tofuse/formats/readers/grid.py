@@ -19,14 +19,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
 from tofuse.formats.geometry import read_pcd, read_ply
-from tofuse.formats.sources import (
-    Reader,
-    ReaderOptions,
-    Sniff,
-    cloud_files,
-    inputs,
-    organised,
-)
+from tofuse.formats.sources import Reader, ReaderOptions, Sniff, cloud_files, inputs, organised
 
 _SUFFIXES = (".ply", ".csv", ".pcd")
 _AMPLITUDES = ("intensity", "amplitude", "i")

@@ -51,11 +51,7 @@ class IfmO3rSource(FileSource):
         self.data = reading.read_bytes(path, limit=_MAX_BYTES)
         self.frames = pcic_frames(self.data, path)
         super().__init__(_times(self.frames))
-        self.metadata |= {
-            "sensor": "ifm O3R (ToF)",
-            "depth_kind": "range",
-            "amplitude_kind": "raw",
-        }
+        self.metadata |= {"sensor": "ifm O3R (ToF)", "depth_kind": "range", "amplitude_kind": "raw"}
         for k, chunks in enumerate(self.frames):
             if not isinstance(chunks, InputError) and INFO in chunks:
                 try:

@@ -283,12 +283,7 @@ class NativeSource(FileSource):
                 f"{', '.join(description.unknown)}"
             )
         self.metadata |= description.stated(
-            "sensor",
-            "serial",
-            "frame_rate_hz",
-            "ambiguity_m",
-            "confidence_max",
-            "amplitude_kind",
+            "sensor", "serial", "frame_rate_hz", "ambiguity_m", "confidence_max", "amplitude_kind"
         )
         if self.camera is not None:
             self.metadata["depth_unit_m"] = description.depth_unit_m

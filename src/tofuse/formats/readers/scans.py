@@ -18,14 +18,7 @@ from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading
-from tofuse.formats.sources import (
-    FileSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    cloud_files,
-    inputs,
-)
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, cloud_files, inputs
 
 MAX_POINTS = 100_000_000
 _E57 = b"ASTM-E57"

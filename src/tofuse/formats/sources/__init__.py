@@ -11,14 +11,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.formats.sources import (
-        bags,
-        cloud_files,
-        inputs,
-        organised,
-        phones,
-        pixels,
-    )
+    from tofuse.formats.sources import bags, cloud_files, inputs, organised, phones, pixels
     from tofuse.formats.sources.file_source import DepthImageSource, FileSource
     from tofuse.formats.sources.imu import gravity_at
     from tofuse.formats.sources.reader import Reader, ReaderOptions, Sniff

@@ -37,11 +37,7 @@ def to_float32(values: NDArray[Any]) -> Float32:
 
 
 def cloud_frame(
-    index: int,
-    timestamp: float,
-    cloud: GeometryRecord,
-    *,
-    origin: Float64 | None = None,
+    index: int, timestamp: float, cloud: GeometryRecord, *, origin: Float64 | None = None
 ) -> CloudFrame:
     """Return a cloud of a file as a view, without invalid points; see `CloudFrame.of`."""
     return CloudFrame.of(
@@ -74,12 +70,7 @@ class CloudFileSource(FileSource):
     """
 
     def __init__(
-        self,
-        path: Path,
-        files: list[Path],
-        load_frame: LoadFrame,
-        *,
-        deproject: bool = False,
+        self, path: Path, files: list[Path], load_frame: LoadFrame, *, deproject: bool = False
     ) -> None:
         super().__init__(np.arange(len(files), dtype=float))
         self.files = files
