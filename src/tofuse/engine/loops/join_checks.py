@@ -151,7 +151,9 @@ class JoinChecks:
                 target = [projective.Target(first.view)]
                 scale = self.fit_statistics.noise_scale
                 aligned = projective.align(second.view, target, T, _ALIGNMENT, usual_scale=scale)
-                if self._within_drift(T, aligned.T_world_source, first.depth, drift):
+                limit = drift + _LINK_ERROR
+                moved = se3.inverse(T) @ aligned.T_world_source
+                if se3.is_within(moved, limit * first.depth, limit):
                     realigned = pair_agreement.agreement(
                         second.view,
                         first.view,
@@ -186,11 +188,6 @@ class JoinChecks:
                 if se3.is_within(motion, max_motion * before.depth, max_motion):
                     return True
         return False
-
-    def _within_drift(self, T: Float64, other: Float64, depth: float, drift: float) -> bool:
-        """Whether two poses differ by no more than drift and the error of a single link."""
-        limit = drift + _LINK_ERROR
-        return se3.is_within(se3.inverse(T) @ other, limit * depth, limit)
 
     def confirming(
         self, a: MergedComponent, b: MergedComponent, T_a_b: Float64, links: list[Link], count: int

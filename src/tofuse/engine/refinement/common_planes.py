@@ -58,9 +58,6 @@ _MIN_POINTS = 10
 _FLATNESS = 0.6
 # Number of shifted divisions of the points into the last cells, which are averaged.
 _DIVISIONS = 4
-# Residuals beyond this many standard deviations have no weight (Tukey's biweight; with 4.685 it has
-# 95 % of the efficiency of least squares for normal errors).
-_ROBUST = 4.685
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +176,7 @@ def refine_clouds(clouds: Sequence[Float64], poses: Float64) -> Aligned:
     size, poses = best
     poses, cells = _level(points, poses, size, 3 * _ITERATIONS, _DIVISIONS)
     sigma = cells[0].typical()[0]
-    limit = _ROBUST * sigma
+    limit = kernels.ROBUST * sigma
     factor, system = _system(points, poses, cells)
     if factor is None:
         return _unmoved(start)
@@ -244,7 +241,7 @@ def _level(
             break
     # Divided again, as cells that moved along were fitted in more iterations.
     cells = _divided(points, refined, size, divisions)
-    limit = _ROBUST * initial_cells[0].typical()[0]
+    limit = kernels.ROBUST * initial_cells[0].typical()[0]
     before, after = (
         np.mean([_support(points, c, limit) for c in divided]) for divided in (initial_cells, cells)
     )
@@ -370,7 +367,6 @@ def _system(
                 variance[a:b],
                 rotations,
                 pair_index,
-                _ROBUST,
                 *out,
             )
             return out

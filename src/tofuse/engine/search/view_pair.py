@@ -18,12 +18,12 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.search.pair_agreement import Agreement, AgreementOptions, agreement
 from tofuse.engine.search.pose_probability import CERTAIN, CONTRADICTION, PoseEvidence
-from tofuse.engine.search.search import Candidate, Match, Search, SearchOptions, are_distinct_poses
+from tofuse.engine.search.search import Candidate, Match, Search, are_distinct_poses
+from tofuse.engine.search.search_grid import SearchOptions
 from tofuse.engine.search.verification import (
     COARSE,
     PATIENT,
     FitStatistics,
-    are_inverse,
     comparable,
     usual_tolerances,
 )
@@ -243,7 +243,7 @@ class _Pair:
         T = forward.T_world_source
         backward = self._aligned((views[1], views[0]), se3.inverse(T), options)
         max_gap_m = _MAX_INCONSISTENCY * self.source.depth
-        consistent = are_inverse(T, backward.T_world_source, max_gap_m, _MAX_INCONSISTENCY)
+        consistent = se3.is_within(T @ backward.T_world_source, max_gap_m, _MAX_INCONSISTENCY)
         if not consistent or not self.fit_statistics.assess(backward).is_usual:
             return None
         pose_agreement = agreement(self.source, self.target, T, self.agreement_options)

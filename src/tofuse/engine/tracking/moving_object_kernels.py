@@ -52,6 +52,8 @@ _PRIOR = 0.05
 PRIOR_ODDS = float(np.log(_PRIOR / (1 - _PRIOR)))
 # Fraction of its depth by which the surface at a pixel may move between frames.
 MAX_MOTION = 0.05
+# Dilation of a predicted mask, in cells of the previous view, and by a fraction of its depth.
+_DILATION, _MAX_DISTANCE = 3, 2 * MAX_MOTION
 
 
 class View(NamedTuple):
@@ -387,23 +389,11 @@ def propagate(
 
 
 @kernel
-def predict(
-    view: View,
-    prev: View,
-    prev_cells: Cells,
-    T: Float64,
-    tolerance: float,
-    radius: int,
-    moving: Bool,
-) -> None:
+def predict(view: View, prev: View, prev_cells: Cells, T: Float64, moving: Bool) -> None:
     """Mark cells that are near, in image and depth, to moving cells of the previous view.
 
     Parameters
     ----------
-    tolerance
-        Fraction of its depth by which a surface may have moved in between.
-    radius
-        In cells of the previous view.
     moving
         (rows, columns) of cells, written.
 
@@ -425,12 +415,10 @@ def predict(
             if k < 0:
                 continue
             k, m = k // prev_stride, m // prev_stride
-            moving[a, b] = _is_near_moving(k, m, z_proj, prev_depth, prev_moving, tolerance, radius)
+            moving[a, b] = _is_near_moving(k, m, z_proj, prev_depth, prev_moving)
             if not moving[a, b]:  # an object may move with the camera
                 k, m = _cell_on_ray(rays[i, j], prev_shape, prev_stride, lookup, lookup_frame)
-                moving[a, b] = k >= 0 and _is_near_moving(
-                    k, m, depth, prev_depth, prev_moving, tolerance, radius
-                )
+                moving[a, b] = k >= 0 and _is_near_moving(k, m, depth, prev_depth, prev_moving)
 
 
 @kernel
@@ -445,18 +433,11 @@ def _cell_on_ray(
 
 
 @kernel
-def _is_near_moving(
-    k: int,
-    m: int,
-    depth: float,
-    prev_depth: Float32,
-    prev_moving: Bool,
-    tolerance: float,
-    radius: int,
-) -> bool:
-    """Whether a moving cell lies within `radius` of cell (k, m), at a similar depth."""
+def _is_near_moving(k: int, m: int, depth: float, prev_depth: Float32, prev_moving: Bool) -> bool:
+    """Whether a moving cell lies near cell (k, m), at a similar depth."""
+    radius = _DILATION
     for p in range(max(k - radius, 0), min(k + radius + 1, prev_depth.shape[0])):
         for q in range(max(m - radius, 0), min(m + radius + 1, prev_depth.shape[1])):
-            if prev_moving[p, q] and abs(prev_depth[p, q] - depth) <= tolerance * depth:
+            if prev_moving[p, q] and abs(prev_depth[p, q] - depth) <= _MAX_DISTANCE * depth:
                 return True
     return False

@@ -39,8 +39,6 @@ _CORE = _DETECT + 0.5 * kernels.MAX_EVIDENCE
 # Fraction of the pixels of a segment that must be beyond `_DETECT`, and the smallest segment, as a
 # fraction of the image.
 _MIN_CORE, _MIN_SIZE = 0.25, 0.004
-# Dilation of a predicted mask, in cells.
-_DILATION = 3
 # Minimum fraction of the comparisons outside of the mask that agree, for a pair of views to be
 # evidence of motion. Below, a wrong pose is as likely.
 _MIN_AGREEMENT = 0.5
@@ -225,15 +223,7 @@ class MovingObjects:
         stride = stride_of(view)
         moving = np.empty(_cell_shape(shape, stride), np.bool_)
         T = np.ascontiguousarray(se3.inverse(last.T_world_camera) @ T_world_camera_predicted)
-        kernels.predict(
-            _sampled(view),
-            _sampled(last.view),
-            last.cells,
-            T,
-            2 * kernels.MAX_MOTION,
-            _DILATION,
-            moving,
-        )
+        kernels.predict(_sampled(view), _sampled(last.view), last.cells, T, moving)
         return _pixels(moving, shape, stride)
 
     def reference_mask(self, reference: PreparedView) -> Bool:
