@@ -226,12 +226,7 @@ def with_camera_correction(
     for view in views:
         projection = view.projection
         if id(projection) not in corrected:
-            frame = projection.frame * [
-                focal_factor,
-                focal_factor,
-                1 / focal_factor,
-                1 / focal_factor,
-            ]
+            frame = projection.frame * np.repeat([focal_factor, 1 / focal_factor], 2)
             corrected[id(projection)] = Projection(
                 np.asarray(projection.rays * np.float32(focal_factor)), projection.lookup, frame
             )

@@ -416,16 +416,10 @@ class _Joiner:
             p = min(link.registration.probability or 0.0, pose_probability.MAX_PROBABILITY)
             if p <= 0:
                 continue
-            independence = min(
-                [
-                    1.0,
-                    *(
-                        self._merged.separation(a, b, link, other)
-                        / verification.MAX_OVERLAP_DISTANCE
-                        for other in counted
-                    ),
-                ]
+            apart = min(
+                (self._merged.separation(a, b, link, other) for other in counted), default=np.inf
             )
+            independence = min(1.0, apart / verification.MAX_OVERLAP_DISTANCE)
             log_odds += independence * float(np.log(p / (1 - p)))
             counted.append(link)
         frames_a = {f for f, c in self._merged.component_of.items() if c in a.T}
