@@ -196,10 +196,8 @@ def stitch(pieces: Spill[Piece], blocks: int, island: int) -> Mesh:
         rows = _rows(piece, ids)
         used_owned = used[rows[: len(piece)]]
         target = new_row[rows[: len(piece)][used_owned]]
-        mesh.vertices[target], mesh.normals[target] = (
-            piece.points[used_owned],
-            piece.normals[used_owned],
-        )
+        mesh.vertices[target] = piece.points[used_owned]
+        mesh.normals[target] = piece.normals[used_owned]
         mesh.sigma[target], mesh.views[target] = piece.sigma[used_owned], piece.views[used_owned]
         used_faces = used[rows[piece.faces[:, 0]]]
         block = np.repeat(piece.blocks, piece.counts)[used_faces]

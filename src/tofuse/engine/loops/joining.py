@@ -302,10 +302,8 @@ class _Joiner:
         """Connect components across gaps by odometry, or by the motion before and after."""
         ordered = sorted(self._merged.tracked.values(), key=lambda s: int(s.frames[0]))
         for before, after in itertools.pairwise(ordered):
-            a, b = (
-                self._merged.of_component(before.component),
-                self._merged.of_component(after.component),
-            )
+            a = self._merged.of_component(before.component)
+            b = self._merged.of_component(after.component)
             if a is b or before.recording != after.recording:
                 continue
             bridges: list[tuple[Link | None, JoinKind]] = [

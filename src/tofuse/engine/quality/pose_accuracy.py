@@ -339,9 +339,7 @@ def contradicted_runs(graph: PoseGraph, frames: Intp, runs: Intp) -> set[int]:
         (K,) frame indices, and number of the run that each belongs to.
     """
     ends = np.sort(np.asarray(graph.ids, np.intp)[graph.edges], axis=1)
-    i, j = graph.edges.T
-    e = se3.log(se3.inverse(graph.measurements) @ se3.inverse(graph.poses[i]) @ graph.poses[j])
-    chi2 = np.einsum("ni,nij,nj->n", e, graph.information, e)
+    chi2 = graph.squared_errors()
     about = {
         int(run): (ends[:, 0] <= frames[runs == run].max())
         & (ends[:, 1] >= frames[runs == run].min())

@@ -258,10 +258,8 @@ class _Scorer:
         """Scores (A, B) of rotations (A, 3, 3) with translations (1, B, 3), or (A, 1) pairwise."""
         source = self.source.subset(points, self.thinned[0])
         target = self.target.subset(points, self.thinned[1])
-        rotations, translations = (
-            np.ascontiguousarray(rotations),
-            np.ascontiguousarray(translations),
-        )
+        rotations = np.ascontiguousarray(rotations)
+        translations = np.ascontiguousarray(translations)
         scores = np.empty((len(rotations), translations.shape[-2]), np.float32)
         run_chunks(
             lambda a, b: kernels.score_grid(
