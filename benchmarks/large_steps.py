@@ -33,7 +33,7 @@ from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.search.pair_agreement import agreement
-from tofuse.engine.search.search import SearchOptions
+from tofuse.engine.search.search_grid import SearchOptions
 from tofuse.engine.search.view_pair import register_pair
 from tofuse.engine.views.prepared_view import PreparedView, prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions

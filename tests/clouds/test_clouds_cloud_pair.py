@@ -380,9 +380,9 @@ def test_wrong_unit_is_found_with_few_points(scans, monkeypatch):
     sizes = []
     registered = cloud_pair._registered
 
-    def counting(source, target, *arguments, **options):
-        sizes.append((len(source), len(target)))
-        return registered(source, target, *arguments, **options)
+    def counting(views, *arguments, **options):
+        sizes.append((len(views.source), len(views.target)))
+        return registered(views, *arguments, **options)
 
     monkeypatch.setattr(cloud_pair, "_registered", counting)
     many = np.random.default_rng(0).permutation(np.concatenate([source, source + 1e-4]))

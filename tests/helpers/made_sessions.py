@@ -17,7 +17,7 @@ from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
-from tofuse.engine.search.search import SearchOptions
+from tofuse.engine.search.search_grid import SearchOptions
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import Opening
 

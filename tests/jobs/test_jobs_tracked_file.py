@@ -29,7 +29,7 @@ from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.progress import Silent
 from tofuse.engine.results.types import FrameRecord
-from tofuse.engine.search.search import SearchOptions
+from tofuse.engine.search.search_grid import SearchOptions
 from tofuse.engine.tracking.base import Step, Tracker
 from tofuse.engine.tracking.keyframe_map import Keyframe
 from written_run_json import run_json

@@ -14,7 +14,7 @@ from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops.appearance import Appearance
 from tofuse.engine.loops.revisits import Revisits
-from tofuse.engine.search.search import SearchOptions
+from tofuse.engine.search.search_grid import SearchOptions
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.view_descriptors import mutual_dissimilarity, view_descriptor

@@ -83,14 +83,14 @@ def test_loop_to_the_least_certain_view_is_tried_as_well():
 @pytest.mark.parametrize(("succeeding", "asked"), [(0, 2), (1, 3), (9, 4)])
 def test_failed_searches_are_limited(monkeypatch, succeeding, asked):
     """Of four rejected candidates, each of which gains information."""
-    monkeypatch.setattr(revisits, "register_near", lambda *_: None)
+    monkeypatch.setattr(revisits, "follow", lambda *_, **__: None)
     searched = []
 
-    def scripted(source, target, fit_statistics, options):
+    def scripted(source, target, **_):
         searched.append(len(searched))
         return registered(np.eye(4), 1.0 if len(searched) <= succeeding else 0.1)
 
-    monkeypatch.setattr(revisits, "register_anywhere", scripted)
+    monkeypatch.setattr(revisits, "register_pair", scripted)
     yaw = [0.0, 1.2, 2.4, 3.6] * 2
     poses = se3.exp(np.array([[0, 0, 0, 0, a, 0] for a in yaw]))
     frames = [replace(corner(poses[0]), index=k) for k in range(8)]

@@ -14,7 +14,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.loops.joining import Joining
 from tofuse.engine.mapping.mapper import Mapper
 from tofuse.engine.mapping.methods import from_method
-from tofuse.engine.search.search import SearchOptions
+from tofuse.engine.search.search_grid import SearchOptions
 
 DEFAULT = from_method("default")
 QUICK = SearchOptions("full", full_candidates=15, photometric_candidates=5)

@@ -20,6 +20,7 @@ from tofuse.engine.refinement.camera_response import Linearised, Response, signi
 from tofuse.engine.refinement.joint_alignment import (
     Priors,
     Refined,
+    RefinedViews,
     align_views,
     mean_support,
     refine,
@@ -47,7 +48,7 @@ def response(views: list[SampledView], refined: Refined) -> Response:
 @pytest.mark.nightly_part
 def test_range_offset_raises_alarm():
     views, refined = kept(0.06)
-    found = check_calibration(views, refined, OPTIONS, Priors.none())
+    found = check_calibration(RefinedViews(views, refined, OPTIONS))
     assert found.alarm
     assert found.errors["offset"] == pytest.approx(0.06, abs=0.015)
     assert found.sigmas["offset"] < 0.01
@@ -71,7 +72,9 @@ def test_odometry_contradicts_errors_that_lead_away_from_it():
 
     def check(poses: np.ndarray) -> CalibrationCheck:
         witness = se3.inverse(poses[0]) @ poses
-        return check_calibration(views, refined, OPTIONS, replace(Priors.none(), witness=witness))
+        return check_calibration(
+            RefinedViews(views, refined, OPTIONS, replace(Priors.none(), witness=witness))
+        )
 
     confirmed, contradicted = check(truth), check(refined.poses)
     assert confirmed.alarm
@@ -84,7 +87,7 @@ def test_odometry_contradicts_errors_that_lead_away_from_it():
 
 def test_correct_camera_raises_no_alarm():
     views, refined = kept(0.0)
-    found = check_calibration(views, refined, OPTIONS, Priors.none())
+    found = check_calibration(RefinedViews(views, refined, OPTIONS))
     assert not found.alarm
     assert found.gap is None
     # What the views estimate still counts: less than the uncertainty of the estimate.
@@ -93,7 +96,7 @@ def test_correct_camera_raises_no_alarm():
 
 def test_few_views_determine_nothing_and_say_what_it_would_do():
     views, refined = kept(0.0, views=5)
-    found = check_calibration(views, refined, OPTIONS, Priors.none())
+    found = check_calibration(RefinedViews(views, refined, OPTIONS))
     assert found.undetermined
     assert not found.estimates
     assert not found.alarm
@@ -110,7 +113,7 @@ def test_significant_error_counts_however_large_its_sigma():
         depth = frame.depth + rng.normal(0, 0.003, frame.depth.shape)
         frame = replace(frame, index=k, camera=CAMERA, depth=depth.astype(np.float32))
         views.append(SampledView.of(prepare_view(frame, SHARP), 1500))
-    found = check_calibration(views, refine(views, truth, OPTIONS), OPTIONS, Priors.none())
+    found = check_calibration(RefinedViews(views, refine(views, truth, OPTIONS), OPTIONS))
     error, sigma = found.estimates["distortion"]
     assert not found.determines("distortion")
     assert error > found.significance * sigma
@@ -147,7 +150,7 @@ def test_focal_length_error_scales_sideways_motion() -> None:
     truth = path(12)
     truth[:, :3, :3] = np.eye(3)
     views = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.003)]
-    found = check_calibration(views, refine(views, truth, OPTIONS), OPTIONS, Priors.none())
+    found = check_calibration(RefinedViews(views, refine(views, truth, OPTIONS), OPTIONS))
     assert found.undetermined
     sideways = truth[:, :2, 3] - truth[:, :2, 3].mean(0)
     expected = 0.01 * np.sqrt((sideways**2).sum(1).mean())
@@ -158,7 +161,7 @@ def test_focal_length_error_scales_sideways_motion() -> None:
 def test_estimate_converges_in_errors_too() -> None:
     """Poses may rest while the error still changes."""
     views, refined = kept(0.06)
-    found = check_calibration(views, refined, OPTIONS, Priors.none())
+    found = check_calibration(RefinedViews(views, refined, OPTIONS))
     rounds = (*COARSE_TO_FINE[:-1], Round(100, 0.0, 0.0))
     options = replace(OPTIONS, rounds=rounds, convergence=1e-4, shared=0.0)
     converged = refine(
@@ -174,7 +177,7 @@ def test_support_of_an_estimate_is_that_of_the_joint_alignment() -> None:
     joint = refine(views, refined.poses, options, **known)
     aligned = align_views(views, refined.poses, options, **known)
     expected = [float(s.of_views(len(views)).mean()) for s in (joint.before, joint.after)]
-    before, after = mean_support(views, aligned, refined.poses, options)
+    before, after = mean_support(aligned, refined.poses)
     # By the same kernel: that for known errors is exact to first order only.
     assert after == pytest.approx(expected[1], rel=1e-9)
     assert before == pytest.approx(expected[0], abs=1e-3)
@@ -228,7 +231,7 @@ def test_gap_that_noise_leaves_confirms_errors_by_which_it_shrinks() -> None:
 @pytest.mark.parametrize("true", [0.0, 0.06])
 def test_views_keep_only_true_error_of_loop(true):
     views, refined = kept(true)
-    loop = Loop.longest(views, refined, OPTIONS)
+    loop = Loop.longest(RefinedViews(views, refined, OPTIONS))
     assert loop is not None
     steps = loop.steps(refined.poses)
     assert loop.error_by_views(steps, kernels.OFFSET, 0.06) == pytest.approx(true, abs=0.02)

@@ -9,7 +9,7 @@ from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import build_graph, external_sensors
-from tofuse.engine.refinement.common_planes import PlaneOptions, refine_clouds
+from tofuse.engine.refinement.common_planes import refine_clouds
 from tofuse.engine.refinement.plane_refinement import Planes
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
 from tofuse.lab.experiments.peaks import PoseErrors, peaks_bound, run_peaks
@@ -30,7 +30,7 @@ def test_peaks_error_is_near_bound():
     sigma = 0.04
     views, truth = peaks_views(sigma, 1)
     thesis = run_peaks(sigma, 1)
-    found = refine_clouds([v.points for v in views], thesis.poses_optimised, PlaneOptions())
+    found = refine_clouds([v.points for v in views], thesis.poses_optimised)
     error = PoseErrors.of(found.poses, truth).position.mean()
     assert error < 1.5 * peaks_bound(sigma)
     assert error < thesis.optimised.position.mean() / 4
@@ -49,7 +49,7 @@ def test_result_is_independent_of_threads():
     found = []
     for count in (1, 2, 3):
         with threads(count):
-            found.append(refine_clouds(clouds, start, PlaneOptions()))
+            found.append(refine_clouds(clouds, start))
     for other in found[1:]:
         np.testing.assert_array_equal(other.poses, found[0].poses)
         np.testing.assert_array_equal(other.covariance, found[0].covariance)

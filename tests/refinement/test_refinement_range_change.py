@@ -12,7 +12,7 @@ from tofuse.engine.refinement.calibration_check import (
     combine_checks,
 )
 from tofuse.engine.refinement.camera_response import Response
-from tofuse.engine.refinement.joint_alignment import Priors, refine
+from tofuse.engine.refinement.joint_alignment import RefinedViews, refine
 from tofuse.engine.refinement.range_change import RangeChange
 from tofuse.engine.stored_views.view_store import SampledView
 
@@ -28,7 +28,7 @@ def checked(views: list[SampledView], factors: np.ndarray) -> CalibrationCheck:
     """Check views whose depth is scaled."""
     scaled = [view.scaled(factor) for view, factor in zip(views, factors, strict=True)]
     refined = refine(scaled, path(VIEWS), OPTIONS)
-    return check_calibration(scaled, refined, OPTIONS, Priors.none())
+    return check_calibration(RefinedViews(scaled, refined, OPTIONS))
 
 
 @pytest.mark.parametrize(("factor", "start"), [(1.04, 12), (0.97, 15)])
@@ -89,7 +89,7 @@ def test_constant_scale_is_no_change(right: list[SampledView], factor: float) ->
     poses = path(VIEWS)
     poses[:, :3, 3] *= factor
     refined = refine(scaled, poses, OPTIONS)
-    assert check_calibration(scaled, refined, OPTIONS, Priors.none()).range_change is None
+    assert check_calibration(RefinedViews(scaled, refined, OPTIONS)).range_change is None
 
 
 def test_change_of_one_submap_is_that_of_the_recording() -> None:

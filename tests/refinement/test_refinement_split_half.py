@@ -9,7 +9,7 @@ import pytest
 
 from aligned_surfaces import OPTIONS, SHARP, corner, path
 from tofuse.engine.quality.trajectory_errors import displacement
-from tofuse.engine.refinement.joint_alignment import Priors, refine
+from tofuse.engine.refinement.joint_alignment import RefinedViews, refine
 from tofuse.engine.refinement.split_half import split_half_errors
 from tofuse.engine.stored_views.view_store import SampledView
 from tofuse.engine.views.prepared_view import prepare_view
@@ -42,7 +42,7 @@ def errors(
         view = prepare_view(replace(frame, depth=depth.astype(np.float32)), SHARP)
         views.append(SampledView.of(view, 1500))
     refined = refine(views, truth, OPTIONS)
-    found = split_half_errors(views, refined, OPTIONS, Priors.none())
+    found = split_half_errors(RefinedViews(views, refined, OPTIONS))
     return displacement(truth, refined.poses), found
 
 

@@ -10,7 +10,7 @@ import pytest
 from made_rooms import OTHER, at, seen, surface
 from pose_errors import pose_error
 from tofuse.engine.geometry import se3
-from tofuse.engine.search.search import SearchOptions
+from tofuse.engine.search.search_grid import SearchOptions
 from tofuse.engine.search.verification import FitStatistics
 from tofuse.engine.tracking import keyframe_map
 from tofuse.engine.tracking.keyframe_map import Keyframe, KeyframeMap, Relocalizer

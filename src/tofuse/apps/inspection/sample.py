@@ -227,7 +227,7 @@ def _aligned(
     source: PreparedView, target: PreparedView, T_target_source: Float64
 ) -> projective.Aligned:
     """Align two small views from an initial pose; without photometric terms if that fails."""
-    targets = [projective.Target(target, np.eye(4))]
+    targets = [projective.Target(target)]
     for options in (_OPTIONS, replace(_OPTIONS, photometric=False)):
         try:
             return projective.align(source, targets, T_target_source, options)

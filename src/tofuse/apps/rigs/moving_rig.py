@@ -20,7 +20,7 @@ from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import reconstructing
 from tofuse.engine.progress import Progress, Silent
-from tofuse.engine.refinement import Priors, joint_alignment, propagate_poses, refined_by_halves
+from tofuse.engine.refinement import joint_alignment, propagate_poses, refined_by_halves
 from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.formats.rigs import Rig, RigCamera
 
@@ -201,9 +201,10 @@ class _JointViews:
         if after.mean() < before.mean() or not connected:
             return dict(self.tracks)
         self.improved, self._poses = True, first @ refinement.poses
+        refined = joint_alignment.RefinedViews(self._views, refinement, _OPTIONS)
         self._halves = [
             tuple(self._propagated(first @ poses) for poses in pair)
-            for pair in refined_by_halves(self._views, refinement, _OPTIONS, Priors.none())
+            for pair in refined_by_halves(refined)
         ]
         return self._propagated(self._poses)
 

@@ -257,11 +257,7 @@ class Registrar(Protocol):
         ...
 
     def register(
-        self,
-        source: Frame,
-        target: Frame,
-        guess: Float64,
-        rng: np.random.Generator,
+        self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
     ) -> Registration:
         """Register `source` into the frame of `target`, starting from `guess` (T_target_source).
 

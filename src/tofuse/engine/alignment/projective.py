@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated
 
@@ -129,10 +129,10 @@ def _points_of_level(view: PreparedView, level: Level) -> Float32:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A view to align with and its pose T_target_world (4, 4)."""
+    """A view to align with and its pose T_target_world (4, 4), by default that of the world."""
 
     view: PreparedView
-    T_target_world: Float64
+    T_target_world: Float64 = field(default_factory=lambda: np.eye(4))
 
 
 @dataclass(frozen=True, eq=False)

@@ -252,9 +252,8 @@ def register_clouds(
             reason = f"the views fit with the source {scale:g} times as large: check its unit"
             return replace(registration, believed=False, reason=reason)
     try:
-        return _registered(
-            source, target, guess, rng, image_registration, always_search=always_search
-        )
+        views = _CloudViews.of(source, target, rng)
+        return _registered(views, guess, image_registration, always_search=always_search)
     except RegistrationError as error:
         if not power:
             raise
@@ -267,15 +266,12 @@ def register_clouds(
 
 
 def _registered(
-    source: Frame,
-    target: Frame,
+    views: _CloudViews,
     guess: Float64 | None,
-    rng: np.random.Generator,
     image_registration: Registration | None = None,
     *,
     always_search: bool = False,
 ) -> Registration:
-    views = _CloudViews.of(source, target, rng)
     options = {"always_search": always_search}
     registration = _registered_views(views, guess, image_registration, **options)
     likely = (registration.probability or 0.0) > _LIKELY
@@ -298,11 +294,9 @@ def _registered_views(
     certain = None if always_search else _certain(views, local)
     if certain is not None and guess is not None:
         return views.with_information(_given_guess(views, certain))
-    poses = (
-        [local]
-        if image_registration is None
-        else [local, views.evaluated(image_registration.T_target_source)]
-    )
+    poses = [local]
+    if image_registration is not None:
+        poses.append(views.evaluated(image_registration.T_target_source))
     proposed, found = _proposed(views, start, guessed=guess is not None)
     poses += proposed
     best = _best(views, poses, found, local, guess, certain)
@@ -379,7 +373,8 @@ def _registered_scaled(
 ) -> Registration | None:
     """Register the scaled source, with few points; None if the result is not accepted."""
     try:
-        registration = _registered(_thinned(source, scale), _thinned(target, 1.0), None, rng)
+        views = _CloudViews.of(_thinned(source, scale), _thinned(target, 1.0), rng)
+        registration = _registered(views, None)
     except RegistrationError:
         return None
     return registration if registration.believed else None
@@ -613,9 +608,7 @@ def _rival(views: _CloudViews, poses: Sequence[_Pose], best: _Pose, T: Float64) 
 
 
 def _registration(
-    views: _CloudViews,
-    best: _Pose,
-    poses: Sequence[_Pose] | None = None,
+    views: _CloudViews, best: _Pose, poses: Sequence[_Pose] | None = None
 ) -> Registration:
     """Align all points from the best pose and evaluate its evidence.
 

@@ -270,8 +270,8 @@ def _hessian(
     gradient is less steep than with fixed matches, so X is computed by finite differences.
     """
     stride = max(1, len(source.view.points) // _DIFFERENCE_POINTS)
-    T_source_centre, T_centre_source = np.eye(4), np.eye(4)
-    T_source_centre[:3, 3], T_centre_source[:3, 3] = pairs.centre, -pairs.centre
+    T_source_centre = se3.translation(pairs.centre)
+    T_centre_source = se3.translation(-pairs.centre)
     plain, cross = pairs.plain_information(unit), pairs.cross_information(unit)
     values, vectors = np.linalg.eigh(plain)
     values = np.maximum(values, 1e-9 * values[-1])

@@ -323,11 +323,8 @@ def _at_centres(inverse_depth: Float64, u: Float64, v: Float64) -> Float64:
     result = inverse_depth
     for _ in range(_SLOPE_ITERATIONS):
         padded = np.pad(result, _HALF_BASELINE)
-        centre, backward, forward = (
-            slice(_HALF_BASELINE, -_HALF_BASELINE),
-            slice(-2 * _HALF_BASELINE),
-            slice(2 * _HALF_BASELINE, None),
-        )
+        centre = slice(_HALF_BASELINE, -_HALF_BASELINE)
+        backward, forward = slice(-2 * _HALF_BASELINE), slice(2 * _HALF_BASELINE, None)
         slopes = []
         for previous, following in (
             (padded[centre, backward], padded[centre, forward]),

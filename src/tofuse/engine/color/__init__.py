@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.color.color_edges import with_color
-    from tofuse.engine.color.color_pairs import measured_pairs
+    from tofuse.engine.color.color_pairs import measured_pairs, with_color
     from tofuse.engine.color.color_views import ColorView
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -1,9 +1,12 @@
-"""Motions between views by their colour images, from patches of one that the other shows."""
+"""Motions between views by their colour images, from patches of one that the other shows.
+
+`with_color` adds them to a pose graph.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 
@@ -12,15 +15,11 @@ from scipy.special import bdtrc
 
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Bool, Float64, Intp
-from tofuse.engine.color.color_views import (
-    ColorView,
-    Search,
-    matched,
-)
+from tofuse.engine.color.color_views import SEARCHES, ColorView, Search, matched
 from tofuse.engine.compute import run_all
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import homogeneous, se3
-from tofuse.engine.graph import Measured
+from tofuse.engine.graph import Measured, Optimiser, PoseGraph, graph_covariances
 
 # Earlier partners of a view, evenly spread over those that show this fraction of its patches.
 _PARTNERS, _OVERLAP = 5, 0.3
@@ -246,3 +245,37 @@ def _disagreement(pairs: Intp, T: Float64, C: Float64) -> float:
             total = A @ C[ij] @ A.T + C[jk] + C[ik]
             found.append(float(error @ np.linalg.solve(total, error)))
     return max(1.0, float(np.median(found)) / _MEDIAN_6) if found else 1.0
+
+
+def with_color(
+    graph: PoseGraph, views: Sequence[ColorView], optimiser: Optimiser
+) -> tuple[PoseGraph, tuple[Measured, ...]]:
+    """Return the optimised graph with the motions between views, and these edges.
+
+    Each search predicts by the poses of the one before. Motions that contradict the others are
+    rejected, as repeated patterns may be mistaken.
+
+    Parameters
+    ----------
+    graph
+        Poses and edges by depth. The views are of some of its frames.
+    views
+        In the order of time.
+    optimiser
+        Solves the graph.
+    """
+    row = {int(index): k for k, index in enumerate(graph.ids)}
+    rows = [row[view.index] for view in views]
+    poses = graph.poses
+    accepted: tuple[Measured, ...] = ()
+    for search in SEARCHES:
+        measured = measured_pairs(views, poses[rows], search)
+        if not measured:
+            return graph, ()
+        extended = graph.with_poses(poses).with_edges(measured)
+        suspected = np.arange(len(extended.edges)) >= len(graph.edges)
+        done = optimiser.optimise(replace(extended, loop=suspected))
+        weights = np.ones(len(suspected)) if done.weights is None else done.weights
+        kept = np.flatnonzero(weights[len(graph.edges) :] >= graph_covariances.MIN_WEIGHT)
+        poses, accepted = done.graph.poses, tuple(measured[k] for k in kept.tolist())
+    return graph.with_poses(poses).with_edges(accepted), accepted

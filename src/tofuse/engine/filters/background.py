@@ -305,9 +305,7 @@ def _check_static(background: BackgroundSurface, frequency: Float64) -> None:
         )
     if frequency.mean() < _MIN_OBJECT:
         raise InputError(
-            "nothing moves in front of the background",
-            where=_OPTION,
-            remedy=_LEAVE + _CUT,
+            "nothing moves in front of the background", where=_OPTION, remedy=_LEAVE + _CUT
         )
 
 
@@ -317,9 +315,7 @@ def _check_complete(masks: Sequence[Bool], z: Float32) -> None:
     interior = sum(int(ndimage.binary_erosion(mask, np.ones((3, 3))).sum()) for mask in masks)
     if outline < _MIN_OUTLINE or interior < _MIN_INNER * np.sum(masks):
         raise InputError(
-            "the moving object can't be separated from the background",
-            where=_OPTION,
-            remedy=_CUT,
+            "the moving object can't be separated from the background", where=_OPTION, remedy=_CUT
         )
 
 

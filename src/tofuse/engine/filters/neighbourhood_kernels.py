@@ -10,12 +10,7 @@ from tofuse.engine.compute import kernel
 
 @kernel
 def is_steeper(
-    z: Float32,
-    rays: Float32,
-    cosine2: np.float32,
-    start: int,
-    stop: int,
-    out: Bool,
+    z: Float32, rays: Float32, cosine2: np.float32, start: int, stop: int, out: Bool
 ) -> None:
     """Write where the angle between the camera and one of 8 neighbours exceeds an obtuse threshold.
 

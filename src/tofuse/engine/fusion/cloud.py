@@ -126,9 +126,8 @@ class CloudBuilder:
             rows[:, 12] = 1
         keys = _voxel_keys(world, self.voxel_m)
         keys, sums = _sum_by_key(keys, rows)
-        sums[:, :] /= sums[
-            :, 6:7
-        ]  # equal weight for each frame, however many pixels it has in the voxel
+        # Equal weight for each frame, however many pixels it has in the voxel.
+        sums /= sums[:, 6:7].copy()
         self._keys.append(keys)
         self._sums.append(sums)
         self._rows += len(keys)

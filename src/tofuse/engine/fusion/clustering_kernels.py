@@ -1,4 +1,4 @@
-"""Mesh simplification: connected components, unique keys, quadrics and areas of triangles."""
+"""Mesh simplification: connected components, quadrics and areas of triangles."""
 
 from __future__ import annotations
 
@@ -6,42 +6,9 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64
 from tofuse.engine.compute import kernel
-from tofuse.engine.fusion.block_kernels import EMPTY, slot_of
 
-
-@kernel
-def number_keys(keys: Int64, number: Int64) -> Int64:
-    """Number non-negative keys (N,) in the order of first occurrence, into `number` (N,).
-
-    Returns the index of each key's first occurrence.
-    """
-    size = 1 << 10
-    table = np.full(size, EMPTY, np.int64)
-    numbers = np.empty(size, np.int64)
-    first = np.empty(size // 2, np.int64)
-    count = 0
-    for k in range(len(keys)):
-        slot = slot_of(table, keys[k])
-        if table[slot] == EMPTY:
-            if 2 * (count + 1) > size:
-                size *= 2
-                table = np.full(size, EMPTY, np.int64)
-                numbers = np.empty(size, np.int64)
-                larger = np.empty(size // 2, np.int64)
-                for n in range(count):
-                    larger[n] = first[n]
-                first = larger
-                for n in range(count):
-                    slot = slot_of(table, keys[first[n]])
-                    table[slot] = keys[first[n]]
-                    numbers[slot] = n
-                slot = slot_of(table, keys[k])
-            table[slot] = keys[k]
-            numbers[slot] = count
-            first[count] = k
-            count += 1
-        number[k] = numbers[slot]
-    return first[:count]
+# Minimum height of a triangle relative to its longest edge: below it, float32 leaves no normal.
+_MIN_HEIGHT = 1e-6
 
 
 @kernel
@@ -81,12 +48,7 @@ def flatten_groups(group: Int32) -> None:
 
 @kernel
 def quadric_sums(
-    vertices: Float32,
-    faces: Int32,
-    group: Int64,
-    centres: Float64,
-    A: Float64,
-    b: Float64,
+    vertices: Float32, faces: Int32, group: Int64, centres: Float64, A: Float64, b: Float64
 ) -> None:
     """Sum the quadrics of the triangles around each group of vertices (Lindstrom 2000).
 
@@ -130,15 +92,13 @@ def quadric_sums(
 
 
 @kernel
-def has_area(vertices: Float32, faces: Int32, min_height: float, out: Bool) -> None:
+def has_area(vertices: Float32, faces: Int32, out: Bool) -> None:
     """Write to `out` (M,) whether each triangle is not degenerate.
 
     Parameters
     ----------
     vertices, faces
         (N, 3) m, and (M, 3) rows of them. Triangles of vertices that are not finite have no area.
-    min_height
-        Smallest height, relative to the longest edge.
     """
     e = np.empty((3, 3))
     for m in range(len(faces)):
@@ -152,4 +112,4 @@ def has_area(vertices: Float32, faces: Int32, min_height: float, out: Bool) -> N
         x = e[0, 1] * e[1, 2] - e[0, 2] * e[1, 1]
         y = e[0, 2] * e[1, 0] - e[0, 0] * e[1, 2]
         z = e[0, 0] * e[1, 1] - e[0, 1] * e[1, 0]
-        out[m] = np.sqrt(x * x + y * y + z * z) > min_height * longest2
+        out[m] = np.sqrt(x * x + y * y + z * z) > _MIN_HEIGHT * longest2

@@ -15,10 +15,8 @@ from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
 from tofuse.engine.views import Projection
 
-_MAX_POINTS, _MIN_POINTS = (
-    20_000,
-    50,
-)  # on the surface, and those that a view must share with others
+# Points on the surface, and those that a view must share with others.
+_MAX_POINTS, _MIN_POINTS = 20_000, 50
 _MAX_SIDE = 480  # pixels of the compared images
 # Blur of the images in pixels, and iterations at each; the width of the neighbourhood in which
 # contrast is equalised, in blurs; and the contrast of noise, in grey levels.

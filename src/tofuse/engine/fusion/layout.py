@@ -22,14 +22,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64
 from tofuse.engine.compute import run_chunks
-from tofuse.engine.fusion.block_kernels import (
-    EDGE,
-    EMPTY,
-    HALF,
-    VOXELS,
-    insert_keys,
-    neighbours_of,
-)
+from tofuse.engine.fusion.block_kernels import EDGE, EMPTY, HALF, VOXELS, insert_keys, neighbours_of
 from tofuse.engine.fusion.range_view import Views, summaries
 from tofuse.engine.fusion.tsdf_kernels import max_informative_depth, near_cubes
 from tofuse.engine.geometry import se3

@@ -17,7 +17,6 @@ from tofuse.engine.fusion.cloud import Cloud, has_color
 from tofuse.engine.fusion.clustering_kernels import (
     flatten_groups,
     has_area,
-    number_keys,
     quadric_sums,
     union_faces,
 )
@@ -106,8 +105,6 @@ _MAX_SAMPLED = 100_000
 # Maximum number of triangles whose edges are collapsed at a time: about 0.4 GB of memory, which the
 # library keeps.
 _MAX_COLLAPSED = 1_000_000
-# Minimum height of a triangle relative to its longest edge: below it, float32 leaves no normal.
-_MIN_HEIGHT = 1e-6
 # Vertices with a smaller cosine between their normals are on different sides of a thin sheet.
 _MAX_OPPOSITE_COSINE = -0.3
 
@@ -244,7 +241,7 @@ class Mesh(Exportable):
     def _without_degenerate(self) -> Mesh:
         """Return the mesh of the triangles that have an area and are finite."""
         valid = np.empty(len(self.faces), bool)
-        has_area(self.vertices, self.faces, _MIN_HEIGHT, valid)
+        has_area(self.vertices, self.faces, valid)
         return self.rows(valid)
 
     def clustered(self, faces: int) -> Mesh:
@@ -286,17 +283,13 @@ class Mesh(Exportable):
             cell = np.floor(coordinate.astype(float) / cell_m).astype(np.int64)
             cell -= cell.min()
             key = key * (cell.max() + 1) + cell
-        number = np.empty(len(key), np.int64)
-        first = number_keys(key, number)
-        order = np.argsort(key[first])
-        rank = np.empty(len(order), np.intp)
-        rank[order] = np.arange(len(order))
+        _, first, number = np.unique(key, return_index=True, return_inverse=True)
         # The sides of a thin sheet stay separate.
         behind = (
             np.einsum("ni,ni->n", self.normals, self.normals[first[number]]) < _MAX_OPPOSITE_COSINE
         )
-        side = 2 * rank[number] + behind
-        count = np.bincount(side, minlength=2 * len(order))
+        side = 2 * number + behind
+        count = np.bincount(side, minlength=2 * len(first))
         return (np.cumsum(count > 0) - 1)[side], count[count > 0]
 
     def _merge_groups(self, group: Intp, count: Intp, faces: Int32, positions: Float64) -> Mesh:

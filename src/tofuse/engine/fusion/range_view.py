@@ -31,20 +31,11 @@ from tofuse.engine.views import (
 _STEPS_PER_OCTAVE, _MIN_LOG2 = 6.0, -14.0
 DECODED = np.r_[0.0, 2.0 ** (np.arange(255) / _STEPS_PER_OCTAVE + _MIN_LOG2)].astype(np.float32)
 _SIGMAS = 1 / np.sqrt(np.maximum(DECODED, DECODED[1]))
-# Minimum cosine of the incidence: beyond, the footprint of a pixel is too large.
-_MIN_COSINE = 0.1
-# Expected relief of surfaces within a window of a few pixels, as a fraction of the depth.
-_RELIEF = 0.002
-# A depth jump between neighbours exceeds this multiple of sigma.
-_JUMP_SIGMAS = 4.0
 # Weight factor of pixels near a jump: they matter only where nothing else was measured.
 _JUMP_WEIGHT = 0.1
 _QUANTILES = (np.arange(17) + 0.5) / 17  # of depths in a summary
 # Relief of smaller extent, as a fraction of the depth, is lost in the noise.
 _MIN_DETAIL = 0.004
-# A pixel within this many sigmas is on the plane of its neighbours. Next to valid pixels it is
-# restored if a filter removed it from a noisy surface.
-_ON_PLANE_SIGMAS = 3.0
 # Options of planes in addition to those of the tracker: minimum fill of windows, maximum offset.
 _MIN_PLANE_FILL, _MAX_PLANE_OFFSET = 0.4, 1.0
 
@@ -117,9 +108,9 @@ class RangeView:
         measured, jump = np.empty(shape, bool), np.zeros(shape, np.uint8)
         shrink_to_planes(
             surface.z, surface.sigma, surface.planes, surface.plane_variance,
-            _RELIEF, _ON_PLANE_SIGMAS, smoothed, variance, measured,
+            smoothed, variance, measured,
         )  # fmt: skip
-        mark_jumps(surface.z, surface.sigma, options.edge_jump, _JUMP_SIGMAS, jump)
+        mark_jumps(surface.z, surface.sigma, options.edge_jump, jump)
         density = _area_mean(frame.valid.astype(np.float32), shape)
         # Half of the pixels of a block; of a sparse image, half of what a block usually has.
         valid = density >= 0.5 * (median(density[density > 0]) if density.any() else 1.0)
@@ -128,16 +119,8 @@ class RangeView:
         usable = (z > 0) & (surface.sigma > 0) & ((jump == 0) | (surface.planes[..., 3] > 0))
         normals = np.empty((*shape, 3), np.int8)
         weight = np.empty(shape, np.float32)
-        pack_view(
-            surface.planes,
-            surface.rays,
-            surface.projection.lengths2,
-            variance,
-            usable,
-            _MIN_COSINE,
-            normals,
-            weight,
-        )
+        lengths2 = surface.projection.lengths2
+        pack_view(surface.planes, surface.rays, lengths2, variance, usable, normals, weight)
         weight[dilated(jump, options.edge_margin)] *= _JUMP_WEIGHT
         usable = weight > 0
         max_z = float(z.max(initial=0.0))
@@ -243,12 +226,7 @@ def with_camera_correction(
     for view in views:
         projection = view.projection
         if id(projection) not in corrected:
-            frame = projection.frame * [
-                focal_factor,
-                focal_factor,
-                1 / focal_factor,
-                1 / focal_factor,
-            ]
+            frame = projection.frame * np.repeat([focal_factor, 1 / focal_factor], 2)
             corrected[id(projection)] = Projection(
                 np.asarray(projection.rays * np.float32(focal_factor)), projection.lookup, frame
             )

@@ -196,10 +196,8 @@ def stitch(pieces: Spill[Piece], blocks: int, island: int) -> Mesh:
         rows = _rows(piece, ids)
         used_owned = used[rows[: len(piece)]]
         target = new_row[rows[: len(piece)][used_owned]]
-        mesh.vertices[target], mesh.normals[target] = (
-            piece.points[used_owned],
-            piece.normals[used_owned],
-        )
+        mesh.vertices[target] = piece.points[used_owned]
+        mesh.normals[target] = piece.normals[used_owned]
         mesh.sigma[target], mesh.views[target] = piece.sigma[used_owned], piece.views[used_owned]
         used_faces = used[rows[piece.faces[:, 0]]]
         block = np.repeat(piece.blocks, piece.counts)[used_faces]
@@ -424,14 +422,7 @@ class Volume:
         """
         net = self._extract(min_views)
         points, normals, intensity, sigma, views = net.vertices
-        return Mesh(
-            points.astype(np.float32),
-            net.faces,
-            normals,
-            to_rgb(intensity),
-            sigma,
-            views,
-        )
+        return Mesh(points.astype(np.float32), net.faces, normals, to_rgb(intensity), sigma, views)
 
     def piece(self, min_views: int = 1) -> Piece:
         """Return the surface of the owned blocks, to be stitched to those of other regions."""
@@ -490,11 +481,7 @@ class Volume:
         return _SurfaceNet(vertices, faces, per_block, cells)
 
     def _faces(
-        self,
-        neighbours: Int32,
-        cells: Int32,
-        starts: Int64,
-        points: Float64,
+        self, neighbours: Int32, cells: Int32, starts: Int64, points: Float64
     ) -> tuple[Int32, Int64]:
         """Return the triangles of the owned blocks, and their number per block."""
         counts = np.zeros(self.owned, np.int64)

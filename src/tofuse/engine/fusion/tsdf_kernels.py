@@ -28,6 +28,15 @@ MAX_VIEWS = 65535  # at which a voxel's counter of views saturates
 _MAX_CELLS = 600
 _NORMAL_UNIT = np.float32(1 / 127)  # of normals stored in bytes
 _MIN_WEIGHT = np.float32(1e-30)  # avoids a division by 0
+# Minimum cosine of the incidence: beyond, the footprint of a pixel is too large.
+_MIN_COSINE = 0.1
+# Expected relief of surfaces within a window of a few pixels, as a fraction of the depth.
+_RELIEF = np.float32(0.002)
+# A pixel within this many sigmas is on the plane of its neighbours. Next to valid pixels it is
+# restored if a filter removed it from a noisy surface.
+_ON_PLANE_SIGMAS = np.float32(3.0)
+# A depth jump between neighbours exceeds this multiple of sigma.
+_JUMP_SIGMAS = np.float32(4.0)
 
 
 class StoredView(NamedTuple):
@@ -179,8 +188,6 @@ def shrink_to_planes(
     sigma: Float32,
     planes: Float32,
     plane_variance: Float32,
-    detail: float,
-    sigmas: float,
     smooth: Float32,
     variance: Float32,
     measured: Bool,
@@ -193,16 +200,11 @@ def shrink_to_planes(
         (H, W) depth in m, 0 where there is none, and its standard deviation.
     planes, plane_variance
         (H, W, 4) of `fit_planes`, and (H, W) the variance of 1/z on them.
-    detail
-        Standard deviation of the surface relief, as a fraction of the depth.
-    sigmas
-        A pixel measures its plane if it is within this number of standard deviations of it.
     smooth, variance, measured
         (H, W) written: depth in m, its variance in m^2, and whether the pixel measures its plane.
     """
     rows, columns = z.shape
     one = np.float32(1)
-    relative, max_sigmas = np.float32(detail), np.float32(sigmas)
     for r in range(rows):
         for c in range(columns):
             depth = z[r, c]
@@ -214,7 +216,7 @@ def shrink_to_planes(
             if not on_plane > 0:
                 continue
             plane = one / on_plane
-            relief = (relative * depth) * (relative * depth)
+            relief = (_RELIEF * depth) * (_RELIEF * depth)
             gain = relief / max(relief + noise, np.float32(1e-12))
             complement2 = (one - gain) * (one - gain)
             # dz = z^2 d(1/z); the removed part of the relief adds to the uncertainty.
@@ -222,25 +224,24 @@ def shrink_to_planes(
             smooth[r, c] = plane + gain * (depth - plane)
             variance[r, c] = gain * gain * noise + complement2 * (fit_variance + min(relief, noise))
             deviation = abs(depth * on_plane - one) * depth
-            measured[r, c] = depth > 0 and deviation <= max_sigmas * sigma[r, c]
+            measured[r, c] = depth > 0 and deviation <= _ON_PLANE_SIGMAS * sigma[r, c]
 
 
 @kernel
-def mark_jumps(z: Float32, sigma: Float32, fraction: float, sigmas: float, jump: UInt8) -> None:
+def mark_jumps(z: Float32, sigma: Float32, fraction: float, jump: UInt8) -> None:
     """Mark the pixels on both sides of a depth edge.
 
     Parameters
     ----------
     z, sigma
         (H, W) depth in m, 0 where there is none, and its standard deviation.
-    fraction, sigmas
-        An edge is a difference by more than this fraction of the depth, and by more than this
-        number of standard deviations.
+    fraction
+        An edge is a difference by more than this fraction of the depth, and by more than noise.
     jump
         (H, W) of zeros; set to 1 at edges.
     """
     rows, columns = z.shape
-    min_fraction, limit = np.float32(fraction), np.float32(sigmas * sigmas)
+    min_fraction, limit = np.float32(fraction), _JUMP_SIGMAS * _JUMP_SIGMAS
     for r in range(rows):
         for c in range(columns):
             a = z[r, c]
@@ -267,7 +268,6 @@ def pack_view(
     lengths2: Float32,
     variance: Float32,
     valid: Bool,
-    min_cosine: float,
     normals: Int8,
     weights: Float32,
 ) -> None:
@@ -282,8 +282,6 @@ def pack_view(
         (H, W, 2) x/z and y/z, and (H, W) the squared ratio of the range to z; NaN where unknown.
     variance, valid
         (H, W) of the depth in m^2, and whether the pixel is to be fused.
-    min_cosine
-        Smallest cosine of incidence of pixels that are fused.
     normals, weights
         (H, W, 3) in units of 1/127, and (H, W) in 1/m^2, written.
     """
@@ -306,7 +304,7 @@ def pack_view(
             normals[r, c, 1] = np.int8(np.rint(np.float32(127) * y))
             normals[r, c, 2] = np.int8(np.rint(np.float32(127) * z))
             cosine = (x * rays[r, c, 0] + y * rays[r, c, 1] + z) / length
-            if valid[r, c] and cosine > min_cosine:
+            if valid[r, c] and cosine > _MIN_COSINE:
                 distance_variance = cosine * cosine * variance[r, c]
                 weights[r, c] = 1 / distance_variance
 
@@ -640,18 +638,7 @@ def integrate(
                         centre, offsets[s], lookup, lookup_frame, rows, columns, pixels, points
                     )
                 voxels = slice(64 * octant, 64 * octant + 64)
-                _fetch(
-                    pixels,
-                    heights[s],
-                    codes[s],
-                    weights,
-                    rear_limits,
-                    factor,
-                    code,
-                    d,
-                    w,
-                    rear,
-                )
+                _fetch(pixels, heights[s], codes[s], weights, rear_limits, factor, code, d, w, rear)
                 _point_to_plane(code, points, d)
                 _update_distances(d, w, rear, reach, distance[b, voxels], weight[b, voxels])
                 _count_views(d, reach, view_count[b, voxels])

@@ -17,12 +17,8 @@ _MIN_FRACTION, _MAX_BELOW = 0.04, 0.02
 _DIRECTIONS, _MAX_NORMALS, _MAX_CAMERAS = 4000, 1000, 100
 # Standard deviations of the roll of a handheld camera, and of its pitch upwards and downwards: most
 # objects are below eye level. Minimum log-likelihood of one camera.
-_ROLL_SIGMA, _PITCH_UP_SIGMA, _PITCH_DOWN_SIGMA, _MIN_LOG_LIKELIHOOD = (
-    np.radians(15.0),
-    np.radians(40.0),
-    np.radians(60.0),
-    -5.0,
-)
+_ROLL_SIGMA, _PITCH_UP_SIGMA, _PITCH_DOWN_SIGMA = np.radians([15.0, 40.0, 60.0])
+_MIN_LOG_LIKELIHOOD = -5.0
 _CORRELATION_ANGLE = np.radians(30.0)  # correlation angle between orientations of cameras
 # Log priors: one camera in twenty is permanently on its side or upside down.
 _LOG_PRIOR_LEVEL, _LOG_PRIOR_ROLLED = 0.0, np.log(0.05)
@@ -156,10 +152,8 @@ def _refined(normals: Float64, up: Float64) -> Float64:
     """Refine up (3,) by least squares, so that surfaces are horizontal or vertical."""
     for _ in range(4):
         cosine = normals @ up
-        vertical, horizontal = (
-            normals[np.abs(cosine) < np.sin(_MAX_NORMAL_ANGLE)],
-            normals[np.abs(cosine) > np.cos(_MAX_NORMAL_ANGLE)],
-        )
+        vertical = normals[np.abs(cosine) < np.sin(_MAX_NORMAL_ANGLE)]
+        horizontal = normals[np.abs(cosine) > np.cos(_MAX_NORMAL_ANGLE)]
         if len(horizontal) < _MIN_FRACTION * len(normals) or not len(horizontal):
             return up
         _, vectors = np.linalg.eigh(vertical.T @ vertical - horizontal.T @ horizontal)

@@ -56,16 +56,12 @@ def from_matrix(R: ArrayLike) -> Float64:
     # Four times the squares of u, v, w, s.
     squares = np.concatenate([1 + 2 * d - trace[..., None], (1 + trace)[..., None]], -1)
     best = squares.argmax(-1)
-    uv, uw, vw = (
-        R[..., 1, 0] + R[..., 0, 1],
-        R[..., 0, 2] + R[..., 2, 0],
-        R[..., 2, 1] + R[..., 1, 2],
-    )
-    us, vs, ws = (
-        R[..., 2, 1] - R[..., 1, 2],
-        R[..., 0, 2] - R[..., 2, 0],
-        R[..., 1, 0] - R[..., 0, 1],
-    )
+    uv = R[..., 1, 0] + R[..., 0, 1]
+    uw = R[..., 0, 2] + R[..., 2, 0]
+    vw = R[..., 2, 1] + R[..., 1, 2]
+    us = R[..., 2, 1] - R[..., 1, 2]
+    vs = R[..., 0, 2] - R[..., 2, 0]
+    ws = R[..., 1, 0] - R[..., 0, 1]
     candidates = np.stack(
         [
             np.stack([squares[..., 0], uv, uw, us], -1),

@@ -250,10 +250,7 @@ def _solve(H: Any, g: Float64) -> Float64 | None:
     """Solve for a symmetric positive definite sparse matrix; None if it is singular."""
     try:
         factor = splu(
-            H,
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
+            H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
     except RuntimeError:
         return None

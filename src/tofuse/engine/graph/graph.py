@@ -324,10 +324,7 @@ class Measured:
 
 
 def build_graph(
-    ids: Sequence[int],
-    poses: Float64,
-    sequence: Sequence[Measured],
-    loops: Sequence[Measured] = (),
+    ids: Sequence[int], poses: Float64, sequence: Sequence[Measured], loops: Sequence[Measured] = ()
 ) -> PoseGraph:
     """Build the graph of posed frames and of the measurements between them.
 

@@ -90,8 +90,7 @@ class Branches:
             self.edges[leaf_edges], self.vertices[level.vertices] = True, True
             degree -= np.bincount(graph.edges[leaf_edges].ravel(), minlength=len(degree))
 
-        e = graph.residuals()[self.edges]
-        chi2 = np.einsum("mi,mij,mj->m", e, graph.information[self.edges], e)
+        chi2 = graph.squared_errors()[self.edges]
         self.errors = np.zeros(len(graph.edges))
         self.errors[self.edges] = np.where(chi2 > ROUNDING, chi2, 0.0)
 

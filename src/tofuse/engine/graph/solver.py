@@ -103,13 +103,12 @@ def solve(
             selection.converged,
             problem,
         )
-    kernel = settings.robust if settings.robust != "truncated" else "none"
 
     def total(x: Float64) -> Float64:
-        return np.where(loop, robust.cost(kernel, x, settings.gate), x)
+        return np.where(loop, robust.cost(settings.robust, x, settings.gate), x)
 
     def weights(x: Float64) -> Float64:
-        return np.where(loop, robust.weight(kernel, x, settings.gate), 1.0)
+        return np.where(loop, robust.weight(settings.robust, x, settings.gate), 1.0)
 
     descent = Descent(problem, problem.start(poses))
     if settings.best_start:

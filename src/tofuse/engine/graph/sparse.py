@@ -154,11 +154,7 @@ class PairSystem:
         return Blocks(diagonal, below), gradient
 
     def relative(
-        self,
-        H: Float64,
-        g: Float64,
-        T_i_j: Float64,
-        unary: tuple[Float64, Float64] | None = None,
+        self, H: Float64, g: Float64, T_i_j: Float64, unary: tuple[Float64, Float64] | None = None
     ) -> tuple[Blocks, Float64]:
         """Assemble from (m, 6, 6) H and (m, 6) g of the right perturbations of (m, 4, 4) T_i_j."""
         A = se3.adjoint(se3.inverse(T_i_j))

@@ -87,8 +87,7 @@ class CoarseToFine(Bounded, Registrar):
         for view in (source, target):
             if len(view) < MIN_PAIRS:
                 raise RegistrationError(
-                    f"has {len(view)} points, {MIN_PAIRS} are needed",
-                    where=f"frame {view.index}",
+                    f"has {len(view)} points, {MIN_PAIRS} are needed", where=f"frame {view.index}"
                 )
         if self.resolution is None:
             finest = self.finest(source, target, max(spacing(source), spacing(target)))

@@ -200,8 +200,7 @@ class Icp(Bounded, Registrar):
         points = Points.of(view, selector.select(view, rng), self.neighbours)
         if len(points) < _MIN_POINTS:
             raise RegistrationError(
-                f"has {len(points)} points, {_MIN_POINTS} are needed",
-                where=f"frame {view.index}",
+                f"has {len(points)} points, {_MIN_POINTS} are needed", where=f"frame {view.index}"
             )
         return points
 

@@ -248,6 +248,12 @@ _LINE_RATIO = 1e-8
 
 
 @kernel
+def _rotated(x: float, y: float, c: float, s: float) -> tuple[float, float]:
+    """Return (x, y) rotated by an angle with this cosine and sine."""
+    return c * x - s * y, s * x + c * y
+
+
+@kernel
 def symmetric_eigen(A: Float64, values: Float64, vectors: Float64) -> None:
     """Eigenvalues (3,), ascending, and eigenvectors, in columns (3, 3), of a symmetric A (3, 3).
 
@@ -270,20 +276,11 @@ def symmetric_eigen(A: Float64, values: Float64, vectors: Float64) -> None:
                 c = 1 / math.sqrt(t * t + 1)
                 s = t * c
                 for k in range(3):
-                    x = A[k, p]
-                    y = A[k, q]
-                    A[k, p] = c * x - s * y
-                    A[k, q] = s * x + c * y
+                    A[k, p], A[k, q] = _rotated(A[k, p], A[k, q], c, s)
                 for k in range(3):
-                    x = A[p, k]
-                    y = A[q, k]
-                    A[p, k] = c * x - s * y
-                    A[q, k] = s * x + c * y
+                    A[p, k], A[q, k] = _rotated(A[p, k], A[q, k], c, s)
                 for k in range(3):
-                    x = vectors[k, p]
-                    y = vectors[k, q]
-                    vectors[k, p] = c * x - s * y
-                    vectors[k, q] = s * x + c * y
+                    vectors[k, p], vectors[k, q] = _rotated(vectors[k, p], vectors[k, q], c, s)
     for a in range(3):
         values[a] = A[a, a]
     for a in range(2):

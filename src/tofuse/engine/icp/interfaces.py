@@ -69,8 +69,7 @@ class Points:
     def _column(self, values: Float32 | UInt8 | None, name: str) -> Float64:
         if values is None:
             raise RegistrationError(
-                f"has no {name}, which this registration compares",
-                where=f"frame {self.view.index}",
+                f"has no {name}, which this registration compares", where=f"frame {self.view.index}"
             )
         return values[self.index].astype(np.float64)
 

@@ -84,10 +84,9 @@ class SurfacePairs:
 
     def motion(self, xi: Float64) -> Float64:
         """Return the motion (4, 4) in the target's frame of a perturbation about the centre."""
-        T_source_centre, T_centre_source = np.eye(4), np.eye(4)
-        T_source_centre[:3, 3], T_centre_source[:3, 3] = self.centre, -self.centre
-        T = self.T_target_source
-        return T @ T_source_centre @ se3.exp(xi) @ T_centre_source @ se3.inverse(T)
+        T, T_centre_source = self.T_target_source, se3.translation(-self.centre)
+        T_target_centre = T @ se3.translation(self.centre)
+        return T_target_centre @ se3.exp(xi) @ T_centre_source @ se3.inverse(T)
 
     def to_origin(self, H: Float64) -> Float64:
         """Transform information (6, 6) about the centre to the source's origin."""
@@ -97,15 +96,13 @@ class SurfacePairs:
 
     def keep(self, mask: Bool) -> SurfacePairs:
         """Return the pairs of the mask, about the same centre."""
-        return SurfacePairs(
-            self.T_target_source,
-            self.centre,
-            self.points[mask],
-            self.residual[mask],
-            self.target_normals[mask],
-            self.source_normals[mask],
-            self.weight[mask],
-            self.resolution,
+        return replace(
+            self,
+            points=self.points[mask],
+            residual=self.residual[mask],
+            target_normals=self.target_normals[mask],
+            source_normals=self.source_normals[mask],
+            weight=self.weight[mask],
         )
 
 

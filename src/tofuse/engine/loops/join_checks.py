@@ -89,9 +89,7 @@ class JoinChecks:
         for k in evenly_spaced(np.arange(len(pairs)), _MAX_LEARNT_PAIRS):
             a, b = pairs[k]
             T_a_b = se3.inverse(a.T_component_camera) @ b.T_component_camera
-            aligned = projective.align(
-                b.view, [projective.Target(a.view, np.eye(4))], T_a_b, options
-            )
+            aligned = projective.align(b.view, [projective.Target(a.view)], T_a_b, options)
             if aligned.overlap >= _OVERLAP:
                 self.fit_statistics.learn(aligned, b.depth)
                 result = pair_agreement.agreement(
@@ -150,10 +148,12 @@ class JoinChecks:
                 continue
             agreed = at_implied
             if agreed.contradiction > self.max_contradiction:
-                target = [projective.Target(first.view, np.eye(4))]
+                target = [projective.Target(first.view)]
                 scale = self.fit_statistics.noise_scale
                 aligned = projective.align(second.view, target, T, _ALIGNMENT, usual_scale=scale)
-                if self._within_drift(T, aligned.T_world_source, first.depth, drift):
+                limit = drift + _LINK_ERROR
+                moved = se3.inverse(T) @ aligned.T_world_source
+                if se3.is_within(moved, limit * first.depth, limit):
                     realigned = pair_agreement.agreement(
                         second.view,
                         first.view,
@@ -188,11 +188,6 @@ class JoinChecks:
                 if se3.is_within(motion, max_motion * before.depth, max_motion):
                     return True
         return False
-
-    def _within_drift(self, T: Float64, other: Float64, depth: float, drift: float) -> bool:
-        """Whether two poses differ by no more than drift and the error of a single link."""
-        limit = drift + _LINK_ERROR
-        return se3.is_within(se3.inverse(T) @ other, limit * depth, limit)
 
     def confirming(
         self, a: MergedComponent, b: MergedComponent, T_a_b: Float64, links: list[Link], count: int

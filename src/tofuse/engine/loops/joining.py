@@ -302,10 +302,8 @@ class _Joiner:
         """Connect components across gaps by odometry, or by the motion before and after."""
         ordered = sorted(self._merged.tracked.values(), key=lambda s: int(s.frames[0]))
         for before, after in itertools.pairwise(ordered):
-            a, b = (
-                self._merged.of_component(before.component),
-                self._merged.of_component(after.component),
-            )
+            a = self._merged.of_component(before.component)
+            b = self._merged.of_component(after.component)
             if a is b or before.recording != after.recording:
                 continue
             bridges: list[tuple[Link | None, JoinKind]] = [
@@ -416,16 +414,10 @@ class _Joiner:
             p = min(link.registration.probability or 0.0, pose_probability.MAX_PROBABILITY)
             if p <= 0:
                 continue
-            independence = min(
-                [
-                    1.0,
-                    *(
-                        self._merged.separation(a, b, link, other)
-                        / verification.MAX_OVERLAP_DISTANCE
-                        for other in counted
-                    ),
-                ]
+            apart = min(
+                (self._merged.separation(a, b, link, other) for other in counted), default=np.inf
             )
+            independence = min(1.0, apart / verification.MAX_OVERLAP_DISTANCE)
             log_odds += independence * float(np.log(p / (1 - p)))
             counted.append(link)
         frames_a = {f for f, c in self._merged.component_of.items() if c in a.T}

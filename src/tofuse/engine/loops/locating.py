@@ -285,7 +285,7 @@ class Locator:
         levels = tuple(replace(level, stride=stride) for level in verification.COARSE[:2])
         other, options = self._views[k].view, replace(_ALIGNMENT, levels=levels)
         scale = self._fit_statistics.noise_scale
-        target = projective.Target(other, np.eye(4))
+        target = projective.Target(other)
         aligned = projective.align(few.view, [target], np.eye(4), options, usual_scale=scale)
         target_points = pair_agreement.ComparedView.of(other, self._few_points)
         comparison = pair_agreement.Comparison(few, target_points, self._few_points)

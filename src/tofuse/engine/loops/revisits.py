@@ -18,12 +18,7 @@ from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import LoopRecord
 from tofuse.engine.loops.appearance import Appearance
-from tofuse.engine.loops.candidates import (
-    MAX_OVERLAP_BETWEEN,
-    CandidateSelector,
-    LoopView,
-    Pair,
-)
+from tofuse.engine.loops.candidates import MAX_OVERLAP_BETWEEN, CandidateSelector, LoopView, Pair
 from tofuse.engine.loops.loops import (
     ClosedLoop,
     LoopDetector,
@@ -294,7 +289,7 @@ class _RevisitLoops(Loops):
                 continue
             self._learnt.add(pair)
             guess = se3.inverse(a.T_component_camera) @ b.T_component_camera
-            target = [projective.Target(a.view.without_caches(), np.eye(4))]
+            target = [projective.Target(a.view.without_caches())]
             scale = self._fit_statistics.noise_scale
             aligned = projective.align(
                 b.view.without_caches(), target, guess, _WEAK_PRIOR, usual_scale=scale
@@ -304,10 +299,7 @@ class _RevisitLoops(Loops):
 
     def _confirm(self, target: LoopView, source: LoopView) -> ClosedLoop:
         """Register the later view with the earlier one in both directions, once for each pair."""
-        pair = target.index, source.index
-        if pair not in self._decisions:
-            self._decisions[pair] = self._decide(pair, self._register_near(target, source))
-        return self._decisions[pair]
+        return self._confirm_all([(target, source)])[0]
 
     def _confirm_all(self, pairs: Sequence[tuple[LoopView, LoopView]]) -> list[ClosedLoop]:
         """As `_confirm`, for many pairs (target, source)."""
@@ -324,12 +316,8 @@ class _RevisitLoops(Loops):
         """Register two views from the initial guess of the trajectory."""
         guess = se3.inverse(self._poses[target.index]) @ self._poses[source.index]
         # Without caches, or the data derived for the comparison would stay in memory.
-        return register_near(
-            source.view.without_caches(),
-            target.view.without_caches(),
-            guess,
-            self._fit_statistics,
-        )
+        views = source.view.without_caches(), target.view.without_caches()
+        return follow(*views, guess, fit_statistics=self._fit_statistics)
 
     def _decide(self, pair: Pair, registration: Registration | None) -> ClosedLoop:
         """Accept or reject the registration of frames (i, j)."""
@@ -354,8 +342,12 @@ class _RevisitLoops(Loops):
         registrations, margins = {}, {}
         reasons = {p: "looks similar" if p in similar else closed[p].record.reason for p in pairs}
         for i, j in pairs:
-            registration = register_anywhere(
-                posed[j].view, posed[i].view, self._fit_statistics, self._search
+            registration = register_pair(
+                posed[j].view,
+                posed[i].view,
+                fit_statistics=self._fit_statistics,
+                options=self._search,
+                rival_m=DISTINCT_M,
             )
             if registration is None:
                 reasons[i, j] += "; there are too few surfaces for a search"
@@ -410,28 +402,6 @@ class _RevisitLoops(Loops):
         if len(registration.unobservable) > _MAX_DEGENERATE:
             return f"{len(registration.unobservable)} directions are degenerate"
         return "" if registration.believed else registration.reason
-
-
-def register_near(
-    source: PreparedView,
-    target: PreparedView,
-    guess: Float64,
-    fit_statistics: verification.FitStatistics,
-) -> Registration | None:
-    """Register two views from the guess (4, 4) T_target_source of the trajectory."""
-    return follow(source, target, guess, fit_statistics=fit_statistics)
-
-
-def register_anywhere(
-    source: PreparedView,
-    target: PreparedView,
-    fit_statistics: verification.FitStatistics,
-    options: SearchOptions,
-) -> Registration | None:
-    """Register two views by exhaustive search, without a guess."""
-    return register_pair(
-        source, target, fit_statistics=fit_statistics, options=options, rival_m=DISTINCT_M
-    )
 
 
 def _accepted(closed: Mapping[Pair, ClosedLoop]) -> list[Pair]:

@@ -78,11 +78,7 @@ class Assessment:
     prior_loops: Sequence[PriorLoop]
 
     def run(
-        self,
-        closed: Optimised,
-        refined: Refined,
-        model: Model,
-        components: tuple[Component, ...],
+        self, closed: Optimised, refined: Refined, model: Model, components: tuple[Component, ...]
     ) -> Assessed:
         """Compare images at the final poses, bound the errors of the poses, and judge.
 

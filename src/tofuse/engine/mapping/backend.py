@@ -235,9 +235,7 @@ class BackEnd:
         self._progress.stage("fusing", model.views)
         ids = graph.ids.tolist()
         fused = model.fuse(
-            dict(zip(ids, graph.poses, strict=True)),
-            self._progress.advance,
-            refinement.errors,
+            dict(zip(ids, graph.poses, strict=True)), self._progress.advance, refinement.errors
         )
         initial_poses = dict(zip(ids, closed.sequential, strict=True))
         return fused, model.sketch(initial_poses) if poses_changed and model.surface else None

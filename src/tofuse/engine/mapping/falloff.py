@@ -233,7 +233,7 @@ def _constrained_pose(
     options: projective.ProjectiveOptions,
 ) -> Float64 | None:
     """Return T_target_source (4, 4), if the views fit and constrain it in all directions."""
-    aligned = projective.align(source, [projective.Target(target, np.eye(4))], guess, options)
+    aligned = projective.align(source, [projective.Target(target)], guess, options)
     if not aligned.converged or aligned.inlier_ratio < _MIN_INLIERS or len(aligned.unobservable):
         return None
     return aligned.T_world_source

@@ -172,10 +172,7 @@ class TrackedGraph:
         if interval <= 0:
             return ()
         found = motion_prediction.steps_between_bounded(
-            poses,
-            [r.unobservable for r in records],
-            bounded,
-            np.maximum(times / interval, 1.0),
+            poses, [r.unobservable for r in records], bounded, np.maximum(times / interval, 1.0)
         )
         run_of = np.cumsum(bounded, dtype=np.intp)
         contradicted = pose_accuracy.contradicted_runs(graph, indices[~bounded], run_of[~bounded])

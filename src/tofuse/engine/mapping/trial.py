@@ -308,7 +308,7 @@ class _AlignedViews:
             target, source = self._view(i), self._view(j)
             aligned = None
             if target is not None and source is not None:
-                inputs = source.surface, [projective.Target(target.surface, np.eye(4))]
+                inputs = source.surface, [projective.Target(target.surface)]
                 aligned = projective.align(*inputs, np.eye(4), _ALIGNMENT)
                 fits = aligned.inlier_ratio * aligned.overlap >= _MIN_INLIERS
                 if not fits or len(aligned.unobservable) > 6 - _MIN_CONSTRAINED:
@@ -381,7 +381,7 @@ def _halves_differ(
     Left and right, and upper and lower half; of the source, aligned with the whole target. Each
     half is prepared as an image of its own: planes across the cut would have errors of both.
     """
-    onto = [projective.Target(target, np.eye(4))]
+    onto = [projective.Target(target)]
     rows, columns = np.indices(source.depth.shape)
     weak = np.diag(np.repeat([_HALVES.prior_m, _HALVES.prior_rad], 3) ** -2.0)
     differences, variances = [], []

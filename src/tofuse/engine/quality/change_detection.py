@@ -261,19 +261,12 @@ def _changed_voxels(
     cells, cell = np.unique(np.floor(points / voxel).astype(np.int64), axis=0, return_inverse=True)
     cell = cell.ravel()
     count = np.bincount(cell, minlength=len(cells))
-    log_odds = np.log(_PRIOR / (1 - _PRIOR))
-    log_odds = (
-        log_odds
-        + np.log((1 - _OUTLIER_PROBABILITY) / _OUTLIER_PROBABILITY)
-        * np.bincount(cell, votes)
-        / count
-    )
-    view_counts = np.bincount(
-        np.unique(np.stack([cell, view_numbers]), axis=1)[0], minlength=len(cells)
-    )
-    changed = (log_odds >= np.log(_MIN_POSTERIOR / (1 - _MIN_POSTERIOR)) - 1e-9) & (
-        view_counts >= _MIN_VIEWS
-    )
+    per_vote = np.log((1 - _OUTLIER_PROBABILITY) / _OUTLIER_PROBABILITY)
+    log_odds = np.log(_PRIOR / (1 - _PRIOR)) + per_vote * np.bincount(cell, votes) / count
+    cells_of_views = np.unique(np.stack([cell, view_numbers]), axis=1)[0]
+    view_counts = np.bincount(cells_of_views, minlength=len(cells))
+    likely = log_odds >= np.log(_MIN_POSTERIOR / (1 - _MIN_POSTERIOR)) - 1e-9
+    changed = likely & (view_counts >= _MIN_VIEWS)
     centroids = np.stack([np.bincount(cell, points[:, axis]) / count for axis in range(3)], 1)
     return np.asarray(centroids[changed], np.float64)
 

@@ -46,8 +46,6 @@ MIN_DEPTH, MAX_DEPTH = 0.1, 12.0  # m
 NORMAL_REACH = 2  # pixels
 NORMAL_JUMP = 0.05  # fraction of the depth
 MIN_OVERLAP = 0.35  # fraction of the valid pixels, both ways
-SAME_SURFACE = 0.25  # m
-INLIER_DISTANCE = 0.10  # m
 MAX_FRAMES = 100
 
 
@@ -251,9 +249,7 @@ def pair_agreement(
 
 
 def consistency_of_images(
-    images: Sequence[SurfaceImage],
-    poses: ArrayLike,
-    pairs: Sequence[tuple[int, int]] | None = None,
+    images: Sequence[SurfaceImage], poses: ArrayLike, pairs: Sequence[tuple[int, int]] | None = None
 ) -> Consistency:
     """Map consistency of prepared views under poses (N, 4, 4) T_world_camera.
 
@@ -353,9 +349,7 @@ def _compare(a: SurfaceImage, b: SurfaceImage, T_a_b: Float64) -> tuple[int, int
     points = b.points.reshape(-1, 3)
     transformed = np.empty_like(points)
     transform_points(points, np.ascontiguousarray(T_a_b), transformed)
-    return agreement_sums(
-        transformed, a.pixels(transformed), a.points, a.normals, SAME_SURFACE, INLIER_DISTANCE
-    )
+    return agreement_sums(transformed, a.pixels(transformed), a.points, a.normals)
 
 
 def _rays(camera: Camera) -> Float64:

@@ -124,12 +124,7 @@ class Accuracy:
     def without_bound(self) -> Accuracy:
         """Return the accuracy where an error is known that its evidence does not cover."""
         return replace(
-            self,
-            position_m=np.inf,
-            rotation_rad=np.inf,
-            relative=np.inf,
-            worst=None,
-            causes_m={},
+            self, position_m=np.inf, rotation_rad=np.inf, relative=np.inf, worst=None, causes_m={}
         )
 
 
@@ -288,7 +283,7 @@ def degenerate_directions(
 
     def align_again(k: int) -> None:
         i, j = (views[int(graph.ids[end])].view.without_caches() for end in graph.edges[k])
-        target = [projective.Target(i, np.eye(4))]
+        target = [projective.Target(i)]
         realigned = projective.align(j, target, graph.measurements[k], _ALIGNMENT).unobservable
         # Directions are known to a few degrees only, and the remainder would look measured: a
         # degenerate pair is taken to be degenerate in all directions of its views.
@@ -344,9 +339,7 @@ def contradicted_runs(graph: PoseGraph, frames: Intp, runs: Intp) -> set[int]:
         (K,) frame indices, and number of the run that each belongs to.
     """
     ends = np.sort(np.asarray(graph.ids, np.intp)[graph.edges], axis=1)
-    i, j = graph.edges.T
-    e = se3.log(se3.inverse(graph.measurements) @ se3.inverse(graph.poses[i]) @ graph.poses[j])
-    chi2 = np.einsum("ni,nij,nj->n", e, graph.information, e)
+    chi2 = graph.squared_errors()
     about = {
         int(run): (ends[:, 0] <= frames[runs == run].max())
         & (ends[:, 1] >= frames[runs == run].min())
@@ -365,9 +358,7 @@ def contradicted_runs(graph: PoseGraph, frames: Intp, runs: Intp) -> set[int]:
 
 
 def without_degenerate(
-    graph: PoseGraph,
-    directions: Sequence[Float64],
-    unmeasured: Collection[tuple[int, int]] = (),
+    graph: PoseGraph, directions: Sequence[Float64], unmeasured: Collection[tuple[int, int]] = ()
 ) -> PoseGraph:
     """Return the graph without information of its edges along their degenerate directions.
 

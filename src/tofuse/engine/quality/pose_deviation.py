@@ -75,7 +75,7 @@ def measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> 
     ids = [view.index for view in views]
 
     def measured(i: int, j: int) -> tuple[Measured, Float64]:
-        target = [projective.Target(surfaces[i], np.eye(4))]
+        target = [projective.Target(surfaces[i])]
         T_i_j = se3.inverse(poses[i]) @ poses[j]
         aligned = projective.align(surfaces[j], target, T_i_j, _ALIGNMENT)
         C = covariance(surfaces[j], target, aligned, _ALIGNMENT)
@@ -208,7 +208,7 @@ def fitted(graph: PoseGraph, depth_m: float) -> Fit:
     """
     n, m = len(graph.ids), len(graph.edges)
     information, poses = graph.information, graph.poses
-    variance_scale = max(float(np.median(_chi2(graph))) / _CHI2_MEDIAN, _MIN_SCALE)
+    variance_scale = max(float(np.median(graph.squared_errors())) / _CHI2_MEDIAN, _MIN_SCALE)
     measured_dof = int(
         (
             np.linalg.eigvalsh(information * np.outer(projective.UNITS, projective.UNITS))
@@ -322,15 +322,9 @@ def _steps(graph: PoseGraph, poses: Float64) -> Intp:
     i, j = graph.edges.T
     consecutive = np.flatnonzero(j == i + 1)
     per_pair = (len(graph.ids) - 1) / len(graph.edges)
-    chi2 = _chi2(replace(graph, poses=poses))[consecutive] / per_pair
+    chi2 = graph.with_poses(poses).squared_errors()[consecutive] / per_pair
     threshold = 2 * float(gammaincinv(3, 1 - (1 - _CONFIDENCE) / max(len(consecutive), 1)))
     return graph.edges[consecutive[chi2 > _MAX_RATIO * threshold]]
-
-
-def _chi2(graph: PoseGraph) -> Float64:
-    """Return the (M,) squared errors of the edges, in units of their information."""
-    e = graph.residuals()
-    return np.asarray(np.einsum("mi,mij,mj->m", e, graph.information, e), np.float64)
 
 
 def _robust_fit(graph: PoseGraph) -> solver.Solution:

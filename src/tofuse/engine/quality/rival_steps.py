@@ -87,7 +87,7 @@ def has_rival(
     earlier: PreparedView, later: PreparedView, T_earlier_later: Float64, reach: float
 ) -> bool:
     """Whether a pose within the reach, m, is determined in all directions and fits as well."""
-    targets = [projective.Target(earlier, np.eye(4))]
+    targets = [projective.Target(earlier)]
 
     def aligned(
         starts: Sequence[Float64], options: projective.ProjectiveOptions

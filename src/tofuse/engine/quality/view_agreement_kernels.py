@@ -9,6 +9,9 @@ import numpy as np
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.compute import kernel
 
+# Maximum difference in z of points on the same surface, and distance of those with a residual, m.
+_SAME_SURFACE, _INLIER_DISTANCE = 0.25, 0.10
+
 
 @kernel
 def transform_points(points: Float64, T: Float64, out: Float64) -> None:
@@ -67,12 +70,7 @@ def project_by_lens(points: Float64, lens: Float64, out: Float64) -> None:
 
 @kernel
 def agreement_sums(
-    points: Float64,
-    pixels: Float64,
-    target: Float64,
-    normals: Float32,
-    same_surface: float,
-    inlier: float,
+    points: Float64, pixels: Float64, target: Float64, normals: Float32
 ) -> tuple[int, int, int, float]:
     """Compare points with the image that they project to.
 
@@ -82,10 +80,6 @@ def agreement_sums(
         (N, 3) in the frame of the target's camera, m, and (N, 2) their projections, NaN outside.
     target, normals
         (H, W, 3) points of the target, z = 0 where invalid; its normals, 0 where unknown.
-    same_surface
-        Limit of the difference in z, m, for overlap.
-    inlier
-        Limit of the distance between points, m, for the residual.
 
     Returns
     -------
@@ -103,14 +97,14 @@ def agreement_sums(
         if not target[i, j, 2] > 0:
             continue
         dz = points[k, 2] - target[i, j, 2]
-        if abs(dz) < same_surface:
+        if abs(dz) < _SAME_SURFACE:
             overlapping += 1
         nx, ny, nz = normals[i, j, 0], normals[i, j, 1], normals[i, j, 2]
         if nx == 0 and ny == 0 and nz == 0:
             continue
         plane_points += 1
         dx, dy = points[k, 0] - target[i, j, 0], points[k, 1] - target[i, j, 1]
-        if math.sqrt(dx * dx + dy * dy + dz * dz) <= inlier:
+        if math.sqrt(dx * dx + dy * dy + dz * dz) <= _INLIER_DISTANCE:
             inliers += 1
             r = nx * dx + ny * dy + nz * dz
             squares += r * r

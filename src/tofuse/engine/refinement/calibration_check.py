@@ -25,8 +25,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.camera_response import SIGNIFICANT, Linearised, significance_of
 from tofuse.engine.refinement.joint_alignment import (
     AlignedViews,
-    Priors,
-    Refined,
+    RefinedViews,
     align_views,
     mean_support,
 )
@@ -38,8 +37,8 @@ from tofuse.engine.refinement.range_change import (
     range_change,
 )
 from tofuse.engine.refinement.split_half import rms_motion
-from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
+from tofuse.engine.stored_views import pair_equations
 
 # Multipath and mixed pixels look like an error of the focal length of up to a percent; cameras are
 # calibrated to better than that. Makers specify depth offsets of up to a centimetre.
@@ -188,24 +187,14 @@ def _large(name: str, error: float, limit: float, factor: float = 1.0) -> bool:
     return abs(error) > max(factor * TOLERANCES[name], limit)
 
 
-def check_calibration(
-    views: Sequence[SampledView],
-    refined: Refined,
-    options: pair_equations.RefineOptions,
-    priors: Priors,
-) -> CalibrationCheck:
-    """Estimate the errors of the camera from refined views.
-
-    Parameters
-    ----------
-    views, refined, options, priors
-        Of the joint alignment without errors of the camera, see `refine`.
-    """
+def check_calibration(aligned: RefinedViews) -> CalibrationCheck:
+    """Estimate the errors of the camera from views that were refined without such errors."""
+    refined, count = aligned.refined, len(aligned.views)
     if not len(refined.pairs):
         return CalibrationCheck()
-    first = _FirstEstimates.of(views, refined, options, priors)
-    significance = significance_of(len(views))
-    if len(views) < _MIN_VIEWS:
+    first = _FirstEstimates.of(aligned)
+    significance = significance_of(count)
+    if count < _MIN_VIEWS:
         return CalibrationCheck(motion=first.motion, significance=significance)
     without_error = CalibrationCheck(
         focal_sigma=first.sigmas["focal"],
@@ -215,7 +204,7 @@ def check_calibration(
         significance=significance,
     )
     if first.change is not None:
-        changed = range_change(first.change, views, refined, options, priors)
+        changed = range_change(first.change, aligned)
         if changed is not None and changed.is_large:
             return replace(without_error, range_change=changed)
         if (changed or first.change).is_significant:
@@ -228,8 +217,8 @@ def check_calibration(
             )
     likely = [name for name in first.determined if first.is_likely(name)]
     if not likely:
-        return _check_by_loop(views, refined, first, without_error, options)
-    estimator = _Estimator(views, refined, options, priors, first)
+        return _check_by_loop(aligned, first, without_error)
+    estimator = _Estimator(aligned, first)
     # Errors are correlated: in a joint estimate, the true one remains.
     subsets = [[name] for name in likely] + ([likely] if len(likely) > 1 else [])
     # In parallel, as solving for the poses is serial.
@@ -245,7 +234,7 @@ def check_calibration(
     improves = certain and with_best - support > _SUPPORT_NOISE
     gap = None
     if large or improves:
-        gap = loop_gap(views, refined, best.poses, best.errors, options)
+        gap = loop_gap(aligned, best.poses, best.errors)
     contradicted = (large or improves) and estimator.is_contradicted(best)
     # Multipath looks like a smaller focal length or offset, with which views agree better: a loop
     # must confirm that. The others hardly change it, as their drift resembles any other.
@@ -258,7 +247,7 @@ def check_calibration(
             if name not in errors:
                 errors[name] = float(estimator.estimate([name]).errors[_INDEX[name]])
     elif not contradicted:
-        of_loop = _check_by_loop(views, refined, first, without_error, options)
+        of_loop = _check_by_loop(aligned, first, without_error)
         if of_loop.alarm:
             return of_loop
     # Estimated together, correlated errors may be large and opposite.
@@ -302,16 +291,10 @@ class _FirstEstimates:
     change_motion: tuple[float, float]
 
     @classmethod
-    def of(
-        cls,
-        views: Sequence[SampledView],
-        refined: Refined,
-        options: pair_equations.RefineOptions,
-        priors: Priors,
-    ) -> _FirstEstimates:
-        """Estimate all errors. The parameters are those of `check_calibration`."""
-        poses, pairs = refined.poses, refined.pairs
-        linearised = Linearised.of(views, poses, pairs, options, priors)
+    def of(cls, aligned: RefinedViews) -> _FirstEstimates:
+        """Estimate all errors."""
+        views, poses, pairs = aligned.views, aligned.refined.poses, aligned.refined.pairs
+        linearised = Linearised.of(views, poses, pairs, aligned.options, aligned.priors)
         sensitivity = linearised.response_to_errors()
         change = likely_change(linearised, views, pairs) if len(views) >= _MIN_VIEWS else None
         change_motion = 0.0, 0.0
@@ -354,19 +337,13 @@ class _FirstEstimates:
 class _Estimator:
     """Estimates errors from refined views: the overlaps are fixed, the poses are free.
 
-    The parameters are those of `check_calibration`; of many pairs, a part is used. Estimates start
-    from the first ones, unless these are so large that the overlaps of the views may be wrong.
+    Of many pairs, a part is used. Estimates start from the first ones, unless these are so large
+    that the overlaps of the views may be wrong.
     """
 
-    def __init__(
-        self,
-        views: Sequence[SampledView],
-        refined: Refined,
-        options: pair_equations.RefineOptions,
-        priors: Priors,
-        first: _FirstEstimates,
-    ) -> None:
-        views, pairs, thinned_options = thinned(views, refined.pairs, options)
+    def __init__(self, aligned: RefinedViews, first: _FirstEstimates) -> None:
+        refined, priors = aligned.refined, aligned.priors
+        views, pairs, thinned_options = thinned(aligned.views, refined.pairs, aligned.options)
         # An estimate of camera errors does not model errors that patches share, so it can't be
         # compared with the refined poses.
         self._views, self._first = views, first
@@ -404,7 +381,7 @@ class _Estimator:
 
     def support_of(self, estimate: AlignedViews) -> tuple[float, float]:
         """Mean support of the views without and with the errors of an estimate."""
-        return mean_support(self._views, estimate, self._poses, self._options)
+        return mean_support(estimate, self._poses)
 
 
 def combine_checks(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:
@@ -433,11 +410,7 @@ def _motion(poses: Float64, twists: Float64) -> tuple[float, float]:
 
 
 def _check_by_loop(
-    views: Sequence[SampledView],
-    refined: Refined,
-    first: _FirstEstimates,
-    without_error: CalibrationCheck,
-    options: pair_equations.RefineOptions,
+    aligned: RefinedViews, first: _FirstEstimates, without_error: CalibrationCheck
 ) -> CalibrationCheck:
     """Estimate the errors of the camera from the drift over the longest loop alone.
 
@@ -448,17 +421,17 @@ def _check_by_loop(
 
     Parameters
     ----------
-    views, refined, options
-        As for `check_calibration`.
+    aligned
+        The views, refined without errors.
     first
         The first estimates.
     without_error
         The result if there is no error.
     """
-    loop = Loop.longest(views, refined, options)
+    loop = Loop.longest(aligned)
     if loop is None:
         return without_error
-    uncorrected = loop.aligned(loop.steps(refined.start), np.zeros(kernels.ERRORS))
+    uncorrected = loop.aligned(loop.steps(aligned.refined.start), np.zeros(kernels.ERRORS))
     if not loop.gap(uncorrected, uncorrected).significant:
         return without_error
 

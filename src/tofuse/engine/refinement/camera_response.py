@@ -157,15 +157,13 @@ class Linearised:
         """
         zero_errors, estimate_all = np.zeros(kernels.ERRORS), np.zeros(kernels.ERRORS, np.int64)
         stage = options.rounds[-1]
-        state = pair_equations.directed_pairs(views, pairs, options)
+        state = pair_equations.DirectedPairs.of(views, pairs, options)
         system = priors.system(len(views), np.stack([state.target, state.source], 1))
-        pair_equations.evaluate(
-            views, poses, zero_errors, np.ones_like(estimate_all), state, stage, options
-        )
-        pair_equations.without_exposure(state)
-        pair_equations.rescale(state, stage, options)
-        pair_equations.evaluate(views, poses, zero_errors, estimate_all, state, stage, options)
-        H, g = pair_equations.without_exposure(state, range(kernels.ERRORS))
+        state.evaluate(poses, zero_errors, np.ones_like(estimate_all), stage)
+        state.without_exposure()
+        state.rescale(stage)
+        state.evaluate(poses, zero_errors, estimate_all, stage)
+        H, g = state.without_exposure(range(kernels.ERRORS))
         i, j = system.pairs.T
         T_i_j = se3.inverse(poses[i]) @ poses[j]
         prior_H, prior_g = priors.equations(T_i_j[len(H) :])

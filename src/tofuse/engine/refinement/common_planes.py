@@ -43,44 +43,21 @@ _MIN_VARIANCE = 0.25
 # Cosine of incidence below which the side of a plane that a view observes is unknown; and the
 # distance of two sides, in units of their thickness, above which they are separate surfaces.
 _MIN_COSINE, _SEPARATION = 0.15, 3.0
-
-
-@dataclass(frozen=True)
-class PlaneOptions:
-    """Options of the joint refinement of clouds.
-
-    Attributes
-    ----------
-    coarsest
-        Size of the largest cells, as a fraction of the extent of the median view (the diagonal of
-        the middle 90 % of its points): larger cells would contain views that share no surface.
-        Refinement starts three sizes above the smallest that is flat initially.
-    shrink
-        Ratio of successive sizes.
-    iterations
-        Largest number with each size; three times as many with the last.
-    min_points
-        Smallest number of points of a cell; the median cell must have half as many again.
-    flatness
-        Cells shrink while the median cell's thickness is at most this fraction of its width (of the
-        shorter side; both as standard deviations).
-    divisions
-        Number of shifted divisions of the points into the last cells, which are averaged.
-    robust
-        Residuals beyond this many standard deviations have no weight (Tukey's biweight; with 4.685
-        it has 95 % of the efficiency of least squares for normal errors).
-    convergence
-        Iterations end when points move by less, as a fraction of the size of the cells.
-    """
-
-    coarsest: float = 0.2
-    shrink: float = 0.8
-    iterations: int = 4
-    min_points: int = 10
-    flatness: float = 0.6
-    divisions: int = 4
-    robust: float = 4.685
-    convergence: float = 0.002
+# Size of the largest cells, as a fraction of the extent of the median view (the diagonal of the
+# middle 90 % of its points): larger cells would contain views that share no surface. And the ratio
+# of successive sizes.
+_COARSEST, _SHRINK = 0.2, 0.8
+# Largest number of iterations with each size; three times as many with the last.
+_ITERATIONS = 4
+# Iterations end when points move by less, as a fraction of the size of the cells.
+_CONVERGENCE = 0.002
+# Smallest number of points of a cell; the median cell must have half as many again.
+_MIN_POINTS = 10
+# Cells shrink while the median cell's thickness is at most this fraction of its width (of the
+# shorter side; both as standard deviations).
+_FLATNESS = 0.6
+# Number of shifted divisions of the points into the last cells, which are averaged.
+_DIVISIONS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +146,7 @@ class _PlaneCells:
         return float(thickness), float(width), float(np.median(np.diff(self.start)[self.shared]))
 
 
-def refine_clouds(clouds: Sequence[Float64], poses: Float64, options: PlaneOptions) -> Aligned:
+def refine_clouds(clouds: Sequence[Float64], poses: Float64) -> Aligned:
     """Minimise the distances of the points of all views from the planes that they share.
 
     Parameters
@@ -178,8 +155,6 @@ def refine_clouds(clouds: Sequence[Float64], poses: Float64, options: PlaneOptio
         (n, 3) points of each view, m, in its frame.
     poses
         (N, 4, 4) initial T_world_camera; the first of each connected part stays.
-    options
-        See `PlaneOptions`.
     """
     start = poses
     points = _Points(
@@ -188,27 +163,27 @@ def refine_clouds(clouds: Sequence[Float64], poses: Float64, options: PlaneOptio
         len(clouds),
     )
     best: tuple[float, Float64] | None = None
-    for size in _sizes(points, poses, options).tolist():
-        poses, cells = _level(points, poses, size, options.iterations, options)
+    for size in _sizes(points, poses).tolist():
+        poses, cells = _level(points, poses, size, _ITERATIONS)
         thickness, width, point_count = cells[0].typical()
-        flat = thickness <= options.flatness * width
-        if point_count < _MIN_FILL * options.min_points or (best is not None and not flat):
+        flat = thickness <= _FLATNESS * width
+        if point_count < _MIN_FILL * _MIN_POINTS or (best is not None and not flat):
             break
         if flat:
             best = size, poses
     if best is None:
         return _unmoved(start)
     size, poses = best
-    poses, cells = _level(points, poses, size, 3 * options.iterations, options, options.divisions)
+    poses, cells = _level(points, poses, size, 3 * _ITERATIONS, _DIVISIONS)
     sigma = cells[0].typical()[0]
-    limit = options.robust * sigma
-    factor, system = _system(points, poses, cells, options)
+    limit = kernels.ROBUST * sigma
+    factor, system = _system(points, poses, cells)
     if factor is None:
         return _unmoved(start)
     i, j = system.pairs.T
     relative = se3.inverse(poses[i]) @ poses[j]
     covariance = factor.relative_covariances(relative)
-    initial_cells = _divided(points, start, size, options.divisions)
+    initial_cells = _divided(points, start, size, _DIVISIONS)
     return Aligned(
         poses,
         system.pairs,
@@ -220,23 +195,23 @@ def refine_clouds(clouds: Sequence[Float64], poses: Float64, options: PlaneOptio
     )
 
 
-def _sizes(points: _Points, poses: Float64, options: PlaneOptions) -> Float64:
+def _sizes(points: _Points, poses: Float64) -> Float64:
     """Decreasing sizes of cells.
 
     The first is some steps above the smallest whose cells are flat at the initial poses; coarser
     ones than needed would lose accuracy. If none is flat, all sizes are returned.
     """
-    sizes, first = [options.coarsest * points.extent], 0
+    sizes, first = [_COARSEST * points.extent], 0
     while sizes[-1] > 0:
         cells = _cells(points, poses, _centres(points, poses, sizes[-1]))
         thickness, width, point_count = cells.typical()
-        if point_count < _MIN_FILL * options.min_points:
+        if point_count < _MIN_FILL * _MIN_POINTS:
             break
-        if thickness <= options.flatness * width:
+        if thickness <= _FLATNESS * width:
             first = max(0, len(sizes) - 1 - _SIZES_ABOVE)
-        sizes.append(options.shrink * sizes[-1])
+        sizes.append(_SHRINK * sizes[-1])
     # With better poses, more views may share a cell.
-    smaller = sizes[-1] * options.shrink ** np.arange(1, _SIZES_BELOW + 1)
+    smaller = sizes[-1] * _SHRINK ** np.arange(1, _SIZES_BELOW + 1)
     return np.concatenate([sizes[first:], smaller[smaller > 0]])
 
 
@@ -246,12 +221,7 @@ def _unmoved(poses: Float64) -> Aligned:
 
 
 def _level(
-    points: _Points,
-    poses: Float64,
-    size: float,
-    iterations: int,
-    options: PlaneOptions,
-    divisions: int = 1,
+    points: _Points, poses: Float64, size: float, iterations: int, divisions: int = 1
 ) -> tuple[Float64, list[_PlaneCells]]:
     """Iterate with cells of one size; returns the poses and their cells.
 
@@ -260,18 +230,18 @@ def _level(
     initial_cells = _divided(points, poses, size, divisions)
     refined, cells = poses, initial_cells
     for _ in range(iterations):
-        factor, _ = _system(points, refined, cells, options)
+        factor, _ = _system(points, refined, cells)
         step = factor.step() if factor is not None else None
         if step is None:
             break
         step, motion = _bounded(points, refined, step, _MAX_STEP * size)
         refined = se3.orthonormalise(refined @ se3.exp(step))
         cells = [_cells(points, refined, c.mean[np.diff(c.start) > 0]) for c in cells]
-        if motion < options.convergence * size:
+        if motion < _CONVERGENCE * size:
             break
     # Divided again, as cells that moved along were fitted in more iterations.
     cells = _divided(points, refined, size, divisions)
-    limit = options.robust * initial_cells[0].typical()[0]
+    limit = kernels.ROBUST * initial_cells[0].typical()[0]
     before, after = (
         np.mean([_support(points, c, limit) for c in divided]) for divided in (initial_cells, cells)
     )
@@ -370,11 +340,11 @@ def _back_sides(cells: _PlaneCells, poses: Float64) -> Bool:
 
 
 def _system(
-    points: _Points, poses: Float64, divisions: Sequence[_PlaneCells], options: PlaneOptions
+    points: _Points, poses: Float64, divisions: Sequence[_PlaneCells]
 ) -> tuple[sparse.Factor | None, sparse.PairSystem]:
     """Normal equations of all poses without the planes, averaged over several divisions."""
     n = points.count
-    variances = [_variance(cells, options.min_points) for cells in divisions]
+    variances = [_variance(cells) for cells in divisions]
     pairs = _pairs(divisions, variances, n)
     pair_index = np.full((n, n), -1, np.int64)
     pair_index[pairs[:, 0], pairs[:, 1]] = np.arange(len(pairs))
@@ -397,7 +367,6 @@ def _system(
                 variance[a:b],
                 rotations,
                 pair_index,
-                options.robust,
                 *out,
             )
             return out
@@ -411,9 +380,9 @@ def _system(
     return system.factor(matrix, rhs, _DAMPING), system
 
 
-def _variance(cells: _PlaneCells, min_points: int) -> Float64:
+def _variance(cells: _PlaneCells) -> Float64:
     """(S,) variance of the residuals of each cell, 0 if it has too few points or only one view."""
-    valid = cells.shared & (np.diff(cells.start) >= min_points)
+    valid = cells.shared & (np.diff(cells.start) >= _MIN_POINTS)
     variance = np.where(valid, cells.spread[:, 0], 0.0)
     if valid.any():
         floor = _MIN_VARIANCE * float(np.median(variance[valid]))

@@ -10,7 +10,7 @@ the same system.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -144,6 +144,17 @@ class Refined:
 
 
 @dataclass(frozen=True, eq=False)
+class RefinedViews:
+    """Views with the result of their joint alignment by `refine`, and with what it was given."""
+
+    views: Sequence[SampledView]
+    refined: Refined
+    options: pair_equations.RefineOptions
+    priors: Priors = field(default_factory=Priors.none)
+    calibrate: Sequence[int] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class Bodies:
     """Rigid bodies of views, such as those of a rig's cameras at one instant.
 
@@ -212,17 +223,12 @@ def refine(
     poses, errors, state = aligned.poses, aligned.errors, aligned.state
     fixed_errors = aligned.fixed_errors
     pairs = aligned.pairs
-    final_round = options.rounds[-1]
-    by_patch = not calibrate and pair_equations.depends_on_patches(state, options)
-    after = _support(
-        views, poses, errors, fixed_errors, state, final_round, options, by_patch=by_patch
-    )
+    by_patch = not calibrate and state.depends_on_patches
+    after = _support(state, poses, errors, fixed_errors, by_patch=by_patch)
     if by_patch:
-        pair_equations.discount_shared(views, poses, state, options)
+        state.discount_shared(poses)
     measured = _pairwise_measurements(poses, pairs, state)
-    before = _support(
-        views, start, np.zeros_like(errors), fixed_errors, state, final_round, options
-    )
+    before = _support(state, start, np.zeros_like(errors), fixed_errors)
     moved, scales = aligned.moved, state.known_scales
     return Refined(poses, start, errors, pairs, moved, before, after, *measured, scales)
 
@@ -279,33 +285,34 @@ def align_views(
     fixed_errors[list(calibrate)] = 0
     motions: list[float] = []
     error_changes = [np.inf]
-    overlapping = _overlapping(views, poses, options, bodies) if pairs is None else pairs
-    known = None if scales is None else scales.of(overlapping)
-    state = pair_equations.directed_pairs(views, overlapping, options, known)
-    system = _system(state, len(views), priors, bodies)
+
+    def compared(
+        poses: Float64, scales: pair_equations.KnownScales | None
+    ) -> tuple[pair_equations.DirectedPairs, sparse.PairSystem]:
+        overlapping = _overlapping(views, poses, options, bodies) if pairs is None else pairs
+        known = None if scales is None else scales.of(overlapping)
+        state = pair_equations.DirectedPairs.of(views, overlapping, options, known)
+        return state, _system(state, priors, bodies)
+
+    state, system = compared(poses, scales)
     motion_since_overlaps = 0.0
     earlier_error_step = np.zeros(kernels.ERRORS)
     for stage in options.rounds:
         if motion_since_overlaps >= _MAX_MOTION:
-            overlapping = _overlapping(views, poses, options, bodies)
-            known = state.known_scales.of(overlapping)
-            state = pair_equations.directed_pairs(views, overlapping, options, known)
-            system = _system(state, len(views), priors, bodies)
+            state, system = compared(poses, state.known_scales)
             motion_since_overlaps = 0.0
         for _ in range(stage.iterations if len(state.target) else 0):
             is_last = stage is options.rounds[-1] and not calibrate
-            by_patch = is_last and pair_equations.depends_on_patches(state, options)
-            pair_equations.evaluate(
-                views, poses, errors, fixed_errors, state, stage, options, by_patch=by_patch
-            )
+            by_patch = is_last and state.depends_on_patches
+            state.evaluate(poses, errors, fixed_errors, stage, by_patch=by_patch)
             if by_patch:
-                pair_equations.discount_shared(views, poses, state, options)
+                state.discount_shared(poses)
             step, error_step = _solve(poses, state, system, fixed_errors, priors, bodies)
             factor, earlier_error_step = _extrapolation(error_step, earlier_error_step)
             step, error_step = factor * step, factor * error_step
             poses = _apply_step(poses, step, bodies)
             errors = errors + error_step
-            pair_equations.rescale(state, stage, options)
+            state.rescale(stage)
             motions.append(float(np.abs(step / projective.UNITS).max()))
             motion_since_overlaps += motions[-1] if pairs is None else 0.0
             error_changes.append(float(np.abs(error_step).max()) / _ERROR_UNIT)
@@ -335,28 +342,18 @@ def support_of(
 ) -> Support:
     """Support of the same pairs at other poses (N, 4, 4), with the same sigmas."""
     scales = refined.scales.of(refined.pairs)
-    state = pair_equations.directed_pairs(views, refined.pairs, options, scales)
-    fixed_errors = (refined.errors == 0).astype(np.int64)
-    return _support(views, poses, refined.errors, fixed_errors, state, options.rounds[-1], options)
+    state = pair_equations.DirectedPairs.of(views, refined.pairs, options, scales)
+    return _support(state, poses, refined.errors, (refined.errors == 0).astype(np.int64))
 
 
-def mean_support(
-    views: Sequence[SampledView],
-    aligned: AlignedViews,
-    start: Float64,
-    options: pair_equations.RefineOptions,
-) -> tuple[float, float]:
+def mean_support(aligned: AlignedViews, start: Float64) -> tuple[float, float]:
     """Mean support of the views at poses (N, 4, 4) without errors of the camera, and as aligned.
 
     Both with the sigmas of the aligned views.
     """
-    fixed_errors, state, stage = aligned.fixed_errors, aligned.state, options.rounds[-1]
     candidates = (start, np.zeros_like(aligned.errors)), (aligned.poses, aligned.errors)
-    before, after = (
-        _support(views, poses, errors, fixed_errors, state, stage, options)
-        for poses, errors in candidates
-    )
-    count = len(views)
+    before, after = (_support(aligned.state, *of, aligned.fixed_errors) for of in candidates)
+    count = len(start)
     return float(before.of_views(count).mean()), float(after.of_views(count).mean())
 
 
@@ -386,15 +383,15 @@ def align_pairs(
     ends = np.arange(2 * count).reshape(-1, 2)
     poses = np.tile(np.eye(4), (2 * count, 1, 1))
     poses[1::2] = T_i_j
-    state = pair_equations.directed_pairs(views, ends, options, scales.of(pairs))
+    state = pair_equations.DirectedPairs.of(views, ends, options, scales.of(pairs))
     fixed_errors, stage = np.ones(len(errors), np.int64), options.rounds[-1]
     active = np.arange(count)
     for _ in range(_PAIR_ITERATIONS):
         directed = np.concatenate([active, active + count])
         subset = state.subset(directed)
-        pair_equations.evaluate(views, poses, errors, fixed_errors, subset, stage, options)
+        subset.evaluate(poses, errors, fixed_errors, stage)
         aligned, _ = _pairwise_measurements(poses, ends[active], subset)
-        pair_equations.rescale(subset, stage, options)
+        subset.rescale(stage)
         state.put(directed, subset)
         sources = 2 * active + 1
         step = se3.log(se3.inverse(poses[sources]) @ aligned) / projective.UNITS
@@ -439,19 +436,14 @@ def _apply_step(poses: Float64, step: Float64, bodies: Bodies | None) -> Float64
 
 
 def _support(
-    views: Sequence[SampledView],
+    state: pair_equations.DirectedPairs,
     poses: Float64,
     errors: Float64,
     fixed_errors: Int64,
-    state: pair_equations.DirectedPairs,
-    stage: pair_equations.Round,
-    options: pair_equations.RefineOptions,
     *,
     by_patch: bool = False,
 ) -> Support:
-    pair_equations.evaluate(
-        views, poses, errors, fixed_errors, state, stage, options, by_patch=by_patch
-    )
+    state.evaluate(poses, errors, fixed_errors, state.options.rounds[-1], by_patch=by_patch)
     score = state.rows[:, kernels.SUPPORT] - 2 * state.rows[:, kernels.IN_FRONT]
     # A copy, as a view would keep the equations of all pairs in memory.
     return Support(state.target, state.source, score, state.rows[:, kernels.TERMS].copy())
@@ -461,7 +453,7 @@ def _pairwise_measurements(
     poses: Float64, pairs: Intp, state: pair_equations.DirectedPairs
 ) -> tuple[Float64, Float64]:
     """Measurement T_i_j of each pair alone, and its information."""
-    H, g = pair_equations.without_exposure(state)
+    H, g = state.without_exposure()
     count = len(pairs)
     T_i_j = se3.inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]]
     # A perturbation of T_i_j is the opposite one of T_j_i, in the other frame.
@@ -474,15 +466,12 @@ def _pairwise_measurements(
 
 
 def _system(
-    state: pair_equations.DirectedPairs,
-    view_count: int,
-    priors: Priors,
-    bodies: Bodies | None = None,
+    state: pair_equations.DirectedPairs, priors: Priors, bodies: Bodies | None
 ) -> sparse.PairSystem:
     """Return the sparse system of all views, or of their bodies."""
     ends = np.stack([state.target, state.source], 1)
     if bodies is None:
-        return priors.system(view_count, ends)
+        return priors.system(len(state.views), ends)
     return priors.system(int(bodies.body_of_view.max()) + 1, bodies.body_of_view[ends])
 
 
@@ -492,11 +481,11 @@ def _solve(
     system: sparse.PairSystem,
     fixed_errors: Int64,
     priors: Priors,
-    bodies: Bodies | None = None,
+    bodies: Bodies | None,
 ) -> tuple[Float64, Float64]:
     """One Gauss-Newton step: (N, 6) right perturbations of views or bodies, and of the errors."""
     estimated = np.flatnonzero(fixed_errors == 0)
-    H, g = pair_equations.without_exposure(state, estimated.tolist())
+    H, g = state.without_exposure(estimated.tolist())
     if bodies is not None:
         # A perturbation of the body is one of its view, by the adjoint.
         A = np.tile(np.eye(H.shape[1]), (len(H), 1, 1))

@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.joint_alignment import (
-    Refined,
+    RefinedViews,
     align_pairs,
     align_views,
     spread_evenly,
@@ -135,59 +135,41 @@ class Gap:
         return self.remaining_m > self._apparent_m(*self.before) + limit
 
 
-def loop_gap(
-    views: Sequence[SampledView],
-    refined: Refined,
-    poses: Float64,
-    errors: Float64,
-    options: pair_equations.RefineOptions,
-) -> Gap | None:
+def loop_gap(without_errors: RefinedViews, poses: Float64, errors: Float64) -> Gap | None:
     """Closure errors of the longest loop, without and with errors of the camera; None without one.
 
     Parameters
     ----------
-    views, options
-        As for `refine`.
-    refined
+    without_errors
         Result without errors of the camera.
     poses, errors
         (N, 4, 4) and (ERRORS,) result with them.
     """
-    loop = Loop.longest(views, refined, options)
+    loop = Loop.longest(without_errors)
     if loop is None:
         return None
-    without = loop.aligned(loop.steps(refined.poses), np.zeros(kernels.ERRORS))
+    without = loop.aligned(loop.steps(without_errors.refined.poses), np.zeros(kernels.ERRORS))
     return loop.gap(without, loop.aligned(loop.steps(poses), errors))
 
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A chain of overlapping consecutive views i to j, of which the ends overlap too.
+    """A chain of overlapping consecutive views i to j, of which the ends overlap too."""
 
-    `pairs` (M, 2) are all that were refined, and `scales` theirs.
-    """
-
-    views: Sequence[SampledView]
-    pairs: Intp
+    of: RefinedViews
     i: int
     j: int
-    options: pair_equations.RefineOptions
-    scales: pair_equations.KnownScales
 
     @classmethod
-    def longest(
-        cls, views: Sequence[SampledView], refined: Refined, options: pair_equations.RefineOptions
-    ) -> Loop | None:
+    def longest(cls, of: RefinedViews) -> Loop | None:
         """Return the longest loop of refined views; None if there is none."""
-        ends = longest_loop(refined.pairs)
-        if ends is None:
-            return None
-        return cls(views, refined.pairs, *ends, options, refined.scales)
+        ends = longest_loop(of.refined.pairs)
+        return None if ends is None else cls(of, *ends)
 
     @property
     def depth(self) -> float:
         """Median depth of the two ends, m."""
-        return 0.5 * (self.views[self.i].depth + self.views[self.j].depth)
+        return 0.5 * (self.of.views[self.i].depth + self.of.views[self.j].depth)
 
     def steps(self, poses: Float64) -> Float64:
         """Return the relative poses (M, 4, 4) of consecutive views, and last that of the ends."""
@@ -196,7 +178,8 @@ class Loop:
 
     def aligned(self, steps: Float64, errors: Float64) -> Float64:
         """Return the `steps`, each aligned separately with assumed (ERRORS,) of the camera."""
-        return align_pairs(self.views, self._pairs, steps, self.options, errors, self.scales)
+        of = self.of
+        return align_pairs(of.views, self._pairs, steps, of.options, errors, of.refined.scales)
 
     @property
     def _pairs(self) -> Intp:
@@ -219,9 +202,10 @@ class Loop:
         """
         errors = np.zeros(kernels.ERRORS)
         errors[error_index] = error
-        inside = ((self.pairs >= self.i) & (self.pairs <= self.j)).all(1)
+        of, pairs = self.of, self.of.refined.pairs
+        inside = ((pairs >= self.i) & (pairs <= self.j)).all(1)
         views, pairs, options = thinned(
-            self.views[self.i : self.j + 1], self.pairs[inside] - self.i, self.options
+            of.views[self.i : self.j + 1], pairs[inside] - self.i, of.options
         )
         chain = np.array(_chained(steps))
         aligned = align_views(
@@ -231,7 +215,7 @@ class Loop:
 
     def gap(self, before: Float64, after: Float64) -> Gap:
         """Return the gap, given steps aligned without and with errors of the camera."""
-        first, last = (self.views[k].index for k in (self.i, self.j))
+        first, last = (self.of.views[k].index for k in (self.i, self.j))
         without, corrected = _closure_error(before), _closure_error(after)
         change = _norms(se3.inverse(without) @ corrected)
         return Gap(first, last, _norms(without), _norms(corrected), self.depth, change)

@@ -19,6 +19,9 @@ from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.icp import icp_kernels
 
 _MIN_PIVOT = 1e-9
+# Residuals beyond this many standard deviations have no weight (Tukey's biweight; with 4.685 it has
+# 95 % of the efficiency of least squares for normal errors).
+ROBUST = 4.685
 
 
 @kernel
@@ -85,7 +88,6 @@ def plane_equations(
     variance: Float64,
     rotations: Float64,
     pair_row: Int64,
-    robust: float,
     diagonal: Float64,
     gradient: Float64,
     cross: Float64,
@@ -104,8 +106,6 @@ def plane_equations(
         (N, 3, 3) of the poses T_world_camera.
     pair_row
         (N, N) row in `cross` of each pair of views i < j.
-    robust
-        Cut-off of Tukey's biweight, in standard deviations.
     diagonal, gradient, cross
         (N, 6, 6), (N, 6) and (pairs, 6, 6), added to: diagonal blocks, gradient and off-diagonal
         blocks with respect to right perturbations of the poses.
@@ -136,7 +136,7 @@ def plane_equations(
                 view_count += 1
             d0, d1, d2 = x[k, 0] - mean[s, 0], x[k, 1] - mean[s, 1], x[k, 2] - mean[s, 2]
             r = n0 * d0 + n1 * d1 + n2 * d2
-            e2 = r * r / (variance[s] * robust * robust)
+            e2 = r * r / (variance[s] * ROBUST * ROBUST)
             if e2 >= 1:
                 continue
             w = tukey.weight(e2) / variance[s]

@@ -14,12 +14,7 @@ from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import Measured, PoseGraph, external_sensors
 from tofuse.engine.parts import part
-from tofuse.engine.refinement.common_planes import (
-    SUPPORT_NOISE,
-    Aligned,
-    PlaneOptions,
-    refine_clouds,
-)
+from tofuse.engine.refinement.common_planes import SUPPORT_NOISE, Aligned, refine_clouds
 from tofuse.engine.refinement.refinement import (
     MAX_LOSS,
     Refinement,
@@ -91,7 +86,7 @@ class _Planes(Refiner):
             return Refinement(poses, views=len(views))
         positions = np.array([row[view.index] for view in views], np.intp)
         before = poses[positions]
-        aligned = refine_clouds([view.points for view in views], before, PlaneOptions())
+        aligned = refine_clouds([view.points for view in views], before)
         mean = float(aligned.before.mean()), float(aligned.after.mean())
         unchanged = Refinement(poses, False, len(views), len(aligned.pairs), support=mean)
         if not len(aligned.pairs) or mean[1] < mean[0] - SUPPORT_NOISE:

@@ -17,7 +17,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.camera_response import Linearised, significance_of
-from tofuse.engine.refinement.joint_alignment import Priors, Refined, align_views
+from tofuse.engine.refinement.joint_alignment import RefinedViews, align_views
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, thinned
 from tofuse.engine.stored_views import SampledView, pair_equations
 
@@ -142,26 +142,13 @@ def likely_change(
     )
 
 
-def range_change(
-    likely: LikelyChange,
-    views: Sequence[SampledView],
-    refined: Refined,
-    options: pair_equations.RefineOptions,
-    priors: Priors,
-) -> RangeChange | None:
-    """Estimate a likely change in full; None if it is too small or uncertain for that.
-
-    Parameters
-    ----------
-    likely
-        The first estimate.
-    views, refined, options, priors
-        As for `calibration_check.check_calibration`.
-    """
+def range_change(likely: LikelyChange, aligned: RefinedViews) -> RangeChange | None:
+    """Estimate a likely change in full; None if it is too small or uncertain for that."""
+    refined, priors = aligned.refined, aligned.priors
     promising = _PROMISING * likely.limit * likely.sigma
     if abs(likely.scale) < max(_MIN_FIRST_STEP * TOLERANCE, promising):
         return None
-    views, pairs, options = thinned(views, refined.pairs, options)
+    views, pairs, options = thinned(aligned.views, refined.pairs, aligned.options)
     options = replace(options, rounds=_ROUNDS)
     poses = refined.poses @ se3.exp(likely.scale * likely.follow)
     scale, sigma = likely.scale, likely.sigma

@@ -23,13 +23,14 @@ from tofuse.engine.refinement.joint_alignment import (
     MAX_LOSS,
     Priors,
     Refined,
+    RefinedViews,
     refine,
     support_fell,
 )
 from tofuse.engine.refinement.loop_drift import loop_gap
 from tofuse.engine.refinement.range_change import RangeChange
 from tofuse.engine.refinement.split_half import rms_motion, split_half_errors
-from tofuse.engine.refinement.submaps import RefinedSubmap, refine_submaps
+from tofuse.engine.refinement.submaps import refine_submaps
 from tofuse.engine.stored_views import (
     CoarseView,
     PosedView,
@@ -288,7 +289,8 @@ class _Joint(Refiner):
         priors = _priors([p.index for p in posed], sensors)
         alignment = self._options.alignment
         refined = refine(views, poses, alignment, calibrate=self._error_indices, priors=priors)
-        return refined, [self._evaluate(RefinedSubmap(views, refined, priors))]
+        aligned = RefinedViews(views, refined, alignment, priors, self._error_indices)
+        return refined, [self._evaluate(aligned)]
 
     def _in_submaps(
         self, posed: _Views, poses: Float64, sensors: external_sensors.SensorPriors
@@ -305,15 +307,12 @@ class _Joint(Refiner):
             self._error_indices,
         )
 
-    def _evaluate(self, submap: RefinedSubmap) -> _Evaluation:
+    def _evaluate(self, submap: RefinedViews) -> _Evaluation:
         """Evaluate a submap while its views are in memory."""
-        alignment, refined = self._options.alignment, submap.refined
-        split = split_half_errors(
-            submap.views, refined, alignment, submap.priors, self._error_indices
-        )
+        split = split_half_errors(submap)
         if not self._error_indices:
-            return check_calibration(submap.views, refined, alignment, submap.priors), split
-        gap = loop_gap(submap.views, refined, refined.poses, refined.errors, alignment)
+            return check_calibration(submap), split
+        gap = loop_gap(submap, submap.refined.poses, submap.refined.errors)
         return CalibrationCheck(gap=gap), split
 
     def _coarse(self, posed: PosedView[PreparedView]) -> SpilledCoarseView:

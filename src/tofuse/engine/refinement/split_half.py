@@ -23,8 +23,8 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
-from tofuse.engine.refinement.joint_alignment import Priors, Refined, align_views
-from tofuse.engine.stored_views import SampledView, pair_equations, shared_error
+from tofuse.engine.refinement.joint_alignment import RefinedViews, align_views
+from tofuse.engine.stored_views import pair_equations, shared_error
 
 # The poses are near the solution of each half.
 _ROUNDS = (pair_equations.Round(4, 0.0, 0.0),)
@@ -32,44 +32,21 @@ _ROUNDS = (pair_equations.Round(4, 0.0, 0.0),)
 _POINT_STRIDE = 2
 
 
-def split_half_errors(
-    views: Sequence[SampledView],
-    refined: Refined,
-    options: pair_equations.RefineOptions,
-    priors: Priors,
-    calibrate: Sequence[int] = (),
-) -> tuple[float, float]:
-    """Rms errors (m, rad) of refined poses, after alignment, estimated from halves of the images.
-
-    Parameters
-    ----------
-    views, options, priors, calibrate
-        As for `refine`, which returned `refined`.
-    """
+def split_half_errors(aligned: RefinedViews) -> tuple[float, float]:
+    """Rms errors (m, rad) of refined poses, after alignment, from halves of the images."""
     variances = np.zeros(2)
-    for poses in refined_by_halves(views, refined, options, priors, calibrate):
-        first, second = (aligned_motion(refined.poses, half_poses) for half_poses in poses)
+    for poses in refined_by_halves(aligned):
+        first, second = (aligned_motion(aligned.refined.poses, half_poses) for half_poses in poses)
         product = [-(a * b).sum(1).mean() for a, b in zip(first, second, strict=True)]
         variances += np.maximum(product, 0.0)
     position, rotation = np.sqrt(variances).tolist()
     return position, rotation
 
 
-def refined_by_halves(
-    views: Sequence[SampledView],
-    refined: Refined,
-    options: pair_equations.RefineOptions,
-    priors: Priors,
-    calibrate: Sequence[int] = (),
-) -> list[tuple[Float64, Float64]]:
-    """Return the poses (N, 4, 4) by left and right halves of all images, and by upper and lower.
-
-    Parameters
-    ----------
-    views, options, priors, calibrate
-        As for `refine`, which returned `refined`.
-    """
-    single_round = replace(options, rounds=_ROUNDS)
+def refined_by_halves(aligned: RefinedViews) -> list[tuple[Float64, Float64]]:
+    """Return the poses (N, 4, 4) by left and right halves of all images, and by upper and lower."""
+    views, refined = aligned.views, aligned.refined
+    single_round = replace(aligned.options, rounds=_ROUNDS)
 
     def by_half(first_half: bool, halves: Sequence[Bool]) -> Float64:
         half_views = [
@@ -80,9 +57,9 @@ def refined_by_halves(
             half_views,
             refined.poses,
             single_round,
-            calibrate=calibrate,
+            calibrate=aligned.calibrate,
             errors=refined.errors,
-            priors=priors,
+            priors=aligned.priors,
             pairs=refined.pairs,
             scales=refined.scales,
         ).poses

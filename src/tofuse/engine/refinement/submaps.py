@@ -21,6 +21,7 @@ from tofuse.engine.graph import PoseGraph, levenberg
 from tofuse.engine.refinement.joint_alignment import (
     Priors,
     Refined,
+    RefinedViews,
     Support,
     refine,
     spread_evenly,
@@ -57,15 +58,6 @@ class Submap:
 
     views: Intp
     pairs: Intp
-
-
-@dataclass(frozen=True, eq=False)
-class RefinedSubmap:
-    """A refined submap: its views, the result, and the priors."""
-
-    views: Sequence[SampledView]
-    refined: Refined
-    priors: Priors
 
 
 def partition(places: Float64, max_size: int) -> Intp:
@@ -123,8 +115,8 @@ def refine_submaps(
     max_size: int,
     load: Callable[[Intp], list[SampledView]],
     priors: Callable[[Intp | None], Priors],
-    evaluate: Callable[[RefinedSubmap], A],
-    calibrate: Sequence[int] = (),
+    evaluate: Callable[[RefinedViews], A],
+    calibrate: Sequence[int],
 ) -> tuple[Refined, list[A]]:
     """Refine all views submap by submap, see `refine`; also returns `evaluate` of each submap.
 
@@ -150,19 +142,15 @@ def refine_submaps(
     pairs = spread_evenly(overlaps(coarse, poses, options.overlap)[0], options.neighbours)
     parts = [s for s in submaps(world_centroids(coarse, poses), pairs, max_size) if len(s.pairs)]
 
-    results = [
-        # Only one submap's views are in memory at a time.
-        _refine_submap(
-            load(part.views),
-            part,
-            poses[part.views],
-            options,
-            calibrate,
-            priors(part.views),
-            evaluate,
-        )
-        for part in parts
-    ]
+    def refined_alone(part: Submap) -> tuple[Refined, A]:
+        views, start, known = load(part.views), poses[part.views], priors(part.views)
+        start = se3.inverse(start[0]) @ start
+        local = np.searchsorted(part.views, part.pairs)
+        refined = refine(views, start, options, calibrate=calibrate, priors=known, pairs=local)
+        evaluation = evaluate(RefinedViews(views, refined, options, known, calibrate))
+        return _or_unchanged(refined, start), evaluation
+
+    results = [refined_alone(part) for part in parts]  # one submap's views in memory at a time
     refined_submaps = [(part, refined) for part, (refined, _) in zip(parts, results, strict=True)]
     if not refined_submaps:
         empty = np.zeros(0)
@@ -196,23 +184,6 @@ def refine_submaps(
         _combined_scales([(part, r.scales) for part, r in refined_submaps]),
     )
     return combined, [evaluation for _, evaluation in results]
-
-
-def _refine_submap(
-    views: Sequence[SampledView],
-    part: Submap,
-    poses: Float64,
-    options: pair_equations.RefineOptions,
-    calibrate: Sequence[int],
-    priors: Priors,
-    evaluate: Callable[[RefinedSubmap], A],
-) -> tuple[Refined, A]:
-    """Refine one submap separately, from poses (N, 4, 4), and evaluate it."""
-    local = np.searchsorted(part.views, part.pairs)
-    start = se3.inverse(poses[0]) @ poses
-    refined = refine(views, start, options, calibrate=calibrate, priors=priors, pairs=local)
-    evaluation = evaluate(RefinedSubmap(views, refined, priors))
-    return _or_unchanged(refined, start), evaluation
 
 
 def _or_unchanged(refined: Refined, start: Float64) -> Refined:

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
         DISTINCT_M,
         DISTINCT_RAD,
         Search,
-        SearchOptions,
         are_distinct_poses,
     )
+    from tofuse.engine.search.search_grid import SearchOptions
     from tofuse.engine.search.search_kernels import ViewPoints
     from tofuse.engine.search.view_pair import follow, register_pair
 

@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64
-from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import search_kernels as kernels
@@ -25,14 +24,13 @@ from tofuse.engine.search.plane_detection import find_floors
 from tofuse.engine.search.search_grid import (
     MIN_POINTS,
     ResampledView,
+    SearchOptions,
     full_poses,
     planar_poses,
     refine_poses,
     resampled,
 )
 from tofuse.engine.views import PreparedView, with_rough_planes
-
-Mode = Literal["auto", "both", "planar", "full"]
 
 # Many iterations, as the basin of photometric convergence is small; degenerate directions are
 # constrained by albedo alone.
@@ -55,38 +53,6 @@ DISTINCT_M, DISTINCT_RAD = 0.1, 0.0873
 _SUFFICIENT_SCORE = 0.4
 # Reach of the two-way ICP per iteration, relative to the first.
 _REACH_DECAY = 0.85 ** np.arange(28)
-
-
-@dataclass(frozen=True)
-class SearchOptions(Bounded):
-    """Range and effort of the search.
-
-    Attributes
-    ----------
-    mode
-        "planar" (yaw, and translation along the floor), "full" (six dimensions), "both" (planar
-        where both views see a floor, and full: slow, but the margin counts all rivals), or "auto"
-        (full only if there is no floor, or the planar result scores low).
-    yaw
-        Maximum rotation about the vertical in the planar search, rad.
-    turn, roll
-        Maximum rotation in the full search, and about the optical axis, rad.
-    reach
-        Maximum translation, as a fraction of the depth of the views (the mean of their medians).
-    planar_candidates, full_candidates
-        Number of best poses of the planar and of the full grid that are refined by ICP.
-    photometric_candidates
-        Number of best candidates with photometric alignment, where both views have albedo.
-    """
-
-    mode: Mode = "both"
-    yaw: Annotated[float, Bounds(0, 3.1416)] = 1.1
-    turn: Annotated[float, Bounds(0, 3.1416)] = 0.9
-    roll: Annotated[float, Bounds(0, 3.1416)] = 0.5
-    reach: Annotated[float, Bounds(0, 10)] = 0.6
-    planar_candidates: Annotated[int, Bounds(1, 1_000_000)] = 20
-    full_candidates: Annotated[int, Bounds(1, 1_000_000)] = 60
-    photometric_candidates: Annotated[int, Bounds(1, 1_000_000)] = 30
 
 
 def are_distinct_poses(a: Float64, b: Float64, distinct_m: float = DISTINCT_M) -> bool:
@@ -199,29 +165,11 @@ class Search:
         if options.mode != "full":
             floors = find_floors(self.source, self.target)
             if floors is not None:
-                candidates = self._refined(
-                    planar_poses(
-                        s,
-                        t,
-                        floors,
-                        yaw=options.yaw,
-                        reach=options.reach,
-                        count=options.planar_candidates,
-                    )
-                )
+                candidates = self._refined(planar_poses(s, t, floors, options))
             sufficient = bool(candidates) and max(c.score for c in candidates) >= _SUFFICIENT_SCORE
             if options.mode == "planar" or (options.mode == "auto" and sufficient):
                 return Match(self._ranked(candidates), "planar") if candidates else None
-        candidates += self._refined(
-            full_poses(
-                s,
-                t,
-                turn=options.turn,
-                roll=options.roll,
-                reach=options.reach,
-                count=options.full_candidates,
-            )
-        )
+        candidates += self._refined(full_poses(s, t, options))
         return Match(self._ranked(candidates), "full")
 
     def with_proposals(self, poses: Float64, match: Match) -> Match:
@@ -261,7 +209,7 @@ class Search:
         source, target = (view.with_falloff(falloff) for view in (self.source, self.target))
         count = self.options.photometric_candidates
         best, remaining = distinct[:count], distinct[count:]
-        targets = [projective.Target(target, np.eye(4))]
+        targets = [projective.Target(target)]
         alignments = run_all(
             [
                 partial(projective.align, source, targets, candidate.T_target_source, _PHOTOMETRIC)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
+from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
@@ -16,6 +18,8 @@ from tofuse.engine.search import search_kernels as kernels
 from tofuse.engine.search.pair_agreement import nearest_depth, sampled_points
 from tofuse.engine.search.plane_detection import Floor
 from tofuse.engine.views import PreparedView
+
+Mode = Literal["auto", "both", "planar", "full"]
 
 # Steps of the two grids: rad, and as a fraction of the depth. Projective ICP converges from
 # neighbouring poses of either; six dimensions allow only a coarser one.
@@ -40,6 +44,38 @@ _COARSE_DIVISOR, _KEPT_PER_CANDIDATE = 6, 200
 # multiplied by this factor; the best fraction of the cells is then scored in full.
 _CELL_REACH_FACTOR, _PROMISING_FRACTION = 1.5, 0.1
 _CHUNKS = 16
+
+
+@dataclass(frozen=True)
+class SearchOptions(Bounded):
+    """Range and effort of the search.
+
+    Attributes
+    ----------
+    mode
+        "planar" (yaw, and translation along the floor), "full" (six dimensions), "both" (planar
+        where both views see a floor, and full: slow, but the margin counts all rivals), or "auto"
+        (full only if there is no floor, or the planar result scores low).
+    yaw
+        Maximum rotation about the vertical in the planar search, rad.
+    turn, roll
+        Maximum rotation in the full search, and about the optical axis, rad.
+    reach
+        Maximum translation, as a fraction of the depth of the views (the mean of their medians).
+    planar_candidates, full_candidates
+        Number of best poses of the planar and of the full grid that are refined by ICP.
+    photometric_candidates
+        Number of best candidates with photometric alignment, where both views have albedo.
+    """
+
+    mode: Mode = "both"
+    yaw: Annotated[float, Bounds(0, 3.1416)] = 1.1
+    turn: Annotated[float, Bounds(0, 3.1416)] = 0.9
+    roll: Annotated[float, Bounds(0, 3.1416)] = 0.5
+    reach: Annotated[float, Bounds(0, 10)] = 0.6
+    planar_candidates: Annotated[int, Bounds(1, 1_000_000)] = 20
+    full_candidates: Annotated[int, Bounds(1, 1_000_000)] = 60
+    photometric_candidates: Annotated[int, Bounds(1, 1_000_000)] = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,72 +166,38 @@ def _low_pass(albedo: Float64, sigma: float) -> Float32:
 
 
 def planar_poses(
-    s: ResampledView,
-    t: ResampledView,
-    floors: tuple[Floor, Floor],
-    *,
-    yaw: float,
-    reach: float,
-    count: int,
+    s: ResampledView, t: ResampledView, floors: tuple[Floor, Floor], options: SearchOptions
 ) -> Float64:
-    """Return the best T_target_source (N, 4, 4) of the planar grid.
-
-    Parameters
-    ----------
-    s, t
-        Source and target.
-    floors
-        Their floors.
-    yaw
-        Maximum rotation about the vertical, rad.
-    reach
-        Maximum translation, as a fraction of the depth.
-    count
-        Maximum number of poses.
-    """
+    """Return the best T_target_source (N, 4, 4) of the planar grid of a source and a target."""
     floor_s, floor_t = floors
     depth = 0.5 * (s.depth + t.depth)
     upright_s, upright_t = _upright(floor_s.normal), _upright(floor_t.normal)
-    n = round(yaw / _PLANAR_ANGLE)
+    n = round(options.yaw / _PLANAR_ANGLE)
     yaws = np.zeros((2 * n + 1, 3))
     yaws[:, 1] = np.linspace(-n, n, 2 * n + 1) * _PLANAR_ANGLE
     rotations = upright_t.T @ se3.so3_exp(yaws) @ upright_s
-    translations = _ellipsoid_nodes(_PLANAR_STEP * depth, reach * depth, (1.0, 0.0, 1.0))
+    translations = _ellipsoid_nodes(_PLANAR_STEP * depth, options.reach * depth, (1.0, 0.0, 1.0))
     translations[:, 1] = floor_t.height - floor_s.height
     thinned = [
         np.abs(v.points @ f.normal - f.height) < 0.02 + 0.02 * v.points[:, 2]
         for v, f in ((s, floor_s), (t, floor_t))
     ]
-    step = depth * max(_PLANAR_STEP, _PLANAR_ANGLE)
-    return _best_of_grid(
-        _Scorer(s, t, thinned, step),
-        rotations,
-        translations @ upright_t,
-        _PLANAR_POINTS,
-        count,
-    )
+    scorer = _Scorer(s, t, thinned, depth * max(_PLANAR_STEP, _PLANAR_ANGLE))
+    translations, count = translations @ upright_t, options.planar_candidates
+    coarse_points = max(1, _PLANAR_POINTS // _COARSE_DIVISOR)
+    scores = scorer(rotations, translations[None], coarse_points).ravel()
+    best = _highest(scores, _KEPT_PER_CANDIDATE * count)
+    i, j = np.divmod(best, len(translations))
+    return _non_maximum_suppression(scorer, rotations[i], translations[j], _PLANAR_POINTS, count)
 
 
-def full_poses(
-    s: ResampledView, t: ResampledView, *, turn: float, roll: float, reach: float, count: int
-) -> Float64:
-    """Return the best T_target_source (N, 4, 4) of the grid of six dimensions.
-
-    Parameters
-    ----------
-    s, t
-        Source and target.
-    turn, roll
-        Maximum rotation, and about the optical axis, rad.
-    reach
-        Maximum translation, as a fraction of the depth.
-    count
-        Maximum number of poses.
-    """
+def full_poses(s: ResampledView, t: ResampledView, options: SearchOptions) -> Float64:
+    """Return the best T_target_source (N, 4, 4) of the grid of six dimensions."""
+    turn, count = options.turn, options.full_candidates
     depth = 0.5 * (s.depth + t.depth)
-    roll_ratio = roll / turn if turn else 1.0
+    roll_ratio = options.roll / turn if turn else 1.0
     rotations = se3.so3_exp(_ellipsoid_nodes(_FULL_ANGLE, turn, (1.0, 1.0, roll_ratio)))
-    translations = _ellipsoid_nodes(_FULL_STEP * depth, reach * depth, (1.0, 1.0, 1.0))
+    translations = _ellipsoid_nodes(_FULL_STEP * depth, options.reach * depth, (1.0, 1.0, 1.0))
     step = depth * max(_FULL_STEP, _FULL_ANGLE)
     scorer = _Scorer(s, t, [None, None], step)
     rotation_index, translation_index = _promising(
@@ -256,10 +258,8 @@ class _Scorer:
         """Scores (A, B) of rotations (A, 3, 3) with translations (1, B, 3), or (A, 1) pairwise."""
         source = self.source.subset(points, self.thinned[0])
         target = self.target.subset(points, self.thinned[1])
-        rotations, translations = (
-            np.ascontiguousarray(rotations),
-            np.ascontiguousarray(translations),
-        )
+        rotations = np.ascontiguousarray(rotations)
+        translations = np.ascontiguousarray(translations)
         scores = np.empty((len(rotations), translations.shape[-2]), np.float32)
         run_chunks(
             lambda a, b: kernels.score_grid(
@@ -269,19 +269,6 @@ class _Scorer:
             _CHUNKS,
         )
         return scores
-
-
-def _best_of_grid(
-    scorer: _Scorer, rotations: Float64, translations: Float64, points: int, count: int
-) -> Float64:
-    """Score a grid and return its `count` best poses (N, 4, 4) after non-maximum suppression."""
-    scores = scorer(rotations, translations[None], max(1, points // _COARSE_DIVISOR)).ravel()
-    rotation_index, translation_index = np.divmod(
-        _highest(scores, _KEPT_PER_CANDIDATE * count), len(translations)
-    )
-    return _non_maximum_suppression(
-        scorer, rotations[rotation_index], translations[translation_index], points, count
-    )
 
 
 def _non_maximum_suppression(

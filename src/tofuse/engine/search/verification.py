@@ -17,7 +17,6 @@ import numpy as np
 
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64
-from tofuse.engine.geometry import se3
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.engine.search.pair_agreement import AgreementOptions
 
@@ -182,13 +181,6 @@ def _describe(index: int, value: float, usual: float) -> str:
         fractions = np.clip((odds * (1 + floor) - floor) / (1 + odds), 0, 1)
         return f"{fractions[0]:.0%} {_NAMES[index]}, usually {fractions[1]:.0%}"
     return f"{_NAMES[index]} {np.exp(value - usual):.1f} times as large as usual"
-
-
-def are_inverse(
-    T_target_source: Float64, T_source_target: Float64, metres: float, radians: float
-) -> bool:
-    """Whether forward and backward alignments (4, 4) are consistent within `metres`, `radians`."""
-    return se3.is_within(T_target_source @ T_source_target, metres, radians)
 
 
 def usual_tolerances(fit_statistics: FitStatistics) -> AgreementOptions:

@@ -18,12 +18,12 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.search.pair_agreement import Agreement, AgreementOptions, agreement
 from tofuse.engine.search.pose_probability import CERTAIN, CONTRADICTION, PoseEvidence
-from tofuse.engine.search.search import Candidate, Match, Search, SearchOptions, are_distinct_poses
+from tofuse.engine.search.search import Candidate, Match, Search, are_distinct_poses
+from tofuse.engine.search.search_grid import SearchOptions
 from tofuse.engine.search.verification import (
     COARSE,
     PATIENT,
     FitStatistics,
-    are_inverse,
     comparable,
     usual_tolerances,
 )
@@ -226,10 +226,9 @@ class _Pair:
         guess: Float64,
         options: projective.ProjectiveOptions,
     ) -> projective.Aligned:
-        source, target = views
-        return projective.align(
-            source, _as_target(target), guess, options, usual_scale=self.fit_statistics.noise_scale
-        )
+        source, target = views[0], [projective.Target(views[1])]
+        scale = self.fit_statistics.noise_scale
+        return projective.align(source, target, guess, options, usual_scale=scale)
 
     def _consistent_pose(
         self,
@@ -244,7 +243,7 @@ class _Pair:
         T = forward.T_world_source
         backward = self._aligned((views[1], views[0]), se3.inverse(T), options)
         max_gap_m = _MAX_INCONSISTENCY * self.source.depth
-        consistent = are_inverse(T, backward.T_world_source, max_gap_m, _MAX_INCONSISTENCY)
+        consistent = se3.is_within(T @ backward.T_world_source, max_gap_m, _MAX_INCONSISTENCY)
         if not consistent or not self.fit_statistics.assess(backward).is_usual:
             return None
         pose_agreement = agreement(self.source, self.target, T, self.agreement_options)
@@ -324,14 +323,10 @@ class _Pair:
         wide_prior = replace(
             pose.options, prior_m=_FEW_ITERATIONS.prior_m, prior_rad=_FEW_ITERATIONS.prior_rad
         )
-        source, target = pose.views
-        C = covariance(source, _as_target(target), pose.aligned, wide_prior, self.uncertainty)
+        source, target = pose.views[0], [projective.Target(pose.views[1])]
+        C = covariance(source, target, pose.aligned, wide_prior, self.uncertainty)
         if pose.T_target_source is not pose.aligned.T_world_source:
             # Not aligned: add the residual error of the search.
             options = pose.options
             C = C + np.diag(np.array([options.prior_m] * 3 + [options.prior_rad] * 3) ** 2)
         return C
-
-
-def _as_target(view: PreparedView) -> list[projective.Target]:
-    return [projective.Target(view, np.eye(4))]

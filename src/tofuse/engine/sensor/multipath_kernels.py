@@ -17,6 +17,15 @@ X, Y, W, AMPLITUDE, AREA, A, B, C, COLUMNS = range(9)
 # Columns of a mapped surface patch: point, unit normal, albedo in counts, and weight.
 PATCH = 8
 
+# Exponent of the cosine to the optical axis by which amplitude falls off: half of it is due to the
+# lens, half of it due to the lamp.
+FALLOFF = 4.0
+# Lower limit of the cosine of incidence; the direct light of more oblique surfaces is too
+# uncertain.
+_MIN_COSINE = 0.12
+# Limits of the ratio of inverse depths within which a plane is extrapolated.
+_MIN_RATIO, _MAX_RATIO = 0.3, 3.0
+
 # Polynomial coefficients of cos(2 pi t) in t^2, and of sin(2 pi t) in odd powers of t, for
 # |t| <= 1/2; accurate to 1e-6.
 _C0, _C1, _C2, _C3, _C4, _C5 = (
@@ -223,8 +232,6 @@ def choose_planes(
 def surface_radiometry(
     nodes: Float64,
     amplitude_factor: Float64,
-    falloff: float,
-    min_cosine: float,
     has_plane: Bool,
     points: Float64,
     normals: Float64,
@@ -236,11 +243,6 @@ def surface_radiometry(
     ----------
     amplitude_factor
         (Hn, Wn) by which indirect light has raised the amplitude.
-    falloff
-        Exponent of the cosine to the optical axis with which amplitude falls off: half of it is due
-        to the lens, and half to the light source.
-    min_cosine
-        Lower limit of the cosine of incidence.
     has_plane, points, normals
         Written: (Hn, Wn) whether there is a plane; (Hn, Wn, 3) in m; unit, towards the camera.
     values
@@ -262,9 +264,9 @@ def surface_radiometry(
                     values[n, i, j] = 0.0
                 continue
             length = np.sqrt(1.0 + x * x + y * y)
-            cosine = min(max(w / (slope * length), min_cosine), 1.0)
+            cosine = min(max(w / (slope * length), _MIN_COSINE), 1.0)
             r = length / w
-            lens_falloff = length ** (-falloff / 2)
+            lens_falloff = length ** (-FALLOFF / 2)
             points[i, j, 0], points[i, j, 1], points[i, j, 2] = x / w, y / w, 1.0 / w
             normals[i, j, 0], normals[i, j, 1] = -a / slope, -b / slope
             normals[i, j, 2] = -c / slope
@@ -371,9 +373,6 @@ def offscreen_sources(
     albedo: Float64,
     border: Float64,
     border_albedo: Float64,
-    ratio_limits: Float64,
-    falloff: float,
-    min_cosine: float,
     wave_number: float,
     out: Float32,
 ) -> int:
@@ -389,10 +388,6 @@ def offscreen_sources(
         where it is 0, the plane of the nearest border node is extrapolated.
     border, border_albedo
         (N, COLUMNS) nodes at the image's border that have planes, and (N,) their albedo.
-    ratio_limits
-        (2,) smallest and largest ratio of extrapolated to the border node's inverse depth.
-    falloff, min_cosine
-        As in `surface_radiometry`.
     wave_number
         Phase in rad per m of path.
     out
@@ -419,7 +414,7 @@ def offscreen_sources(
             a, b, c = border[nearest, A], border[nearest, B], border[nearest, C]
             cell_albedo = border_albedo[nearest]
             ratio = (a * x + b * y + c) / border[nearest, W]
-            if ratio < ratio_limits[0] or ratio > ratio_limits[1]:
+            if ratio < _MIN_RATIO or ratio > _MAX_RATIO:
                 continue
         w = a * x + b * y + c
         if not w > 0:
@@ -427,8 +422,8 @@ def offscreen_sources(
         slope = np.sqrt(a * a + b * b + c * c)
         length = np.sqrt(1.0 + x * x + y * y)
         r = length / w
-        cosine = min(max(w / (slope * length), min_cosine), 1.0)
-        radiosity = cell_albedo * length ** (-falloff / 2) * cosine / (r * r)
+        cosine = min(max(w / (slope * length), _MIN_COSINE), 1.0)
+        radiosity = cell_albedo * length ** (-FALLOFF / 2) * cosine / (r * r)
         out[count, 0], out[count, 1], out[count, 2] = x / w, y / w, 1.0 / w
         out[count, 3], out[count, 4], out[count, 5] = -a / slope, -b / slope, -c / slope
         out[count, 6] = areas[m] / (w * w * length * cosine)

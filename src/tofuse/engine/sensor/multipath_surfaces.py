@@ -23,25 +23,16 @@ _MAX_LAMP_ANGLE = np.pi / 3
 _CELLS = 12
 # Rows and columns of nodes at the image's border that are extrapolated.
 _BORDER = 3
-# Limits of the ratio of inverse depths within which a plane is extrapolated.
-_INVERSE_DEPTH_RATIO = np.array([0.3, 3.0])
 # A view is added when the camera has moved by this angle (rad), or distance relative to the depth,
 # since the last one; and the maximum number of views.
 _ANGLE, _DISTANCE, _VIEWS = 0.1, 0.05, 100
 # Smallest cosine of incidence of surfaces that are added.
 _MIN_INCIDENCE = 0.25
 
-# Exponent of the cosine to the optical axis by which amplitude falls off: half of it is due to the
-# lens, half of it due to the lamp.
-FALLOFF = 4.0
-
 # Relative distance from the median depth of a block at which a pixel is on another surface.
 _JUMP = 0.03
 # Largest rms misfit of a plane, relative to the depth.
 _MAX_MISFIT = 0.006
-# Lower limit of the cosine of incidence; the direct light of more oblique surfaces is too
-# uncertain.
-MIN_COSINE = 0.12
 
 
 def block_nodes(z: Float32, rays: Float32, amplitude: Float32, step: int) -> Float64:
@@ -129,9 +120,7 @@ class Surfaces:
         has_plane = np.empty(shape, bool)
         points, normals = np.empty((*shape, 3)), np.empty((*shape, 3))
         values = np.empty((5, *shape))
-        kernels.surface_radiometry(
-            nodes, factor, FALLOFF, MIN_COSINE, has_plane, points, normals, values
-        )
+        kernels.surface_radiometry(nodes, factor, has_plane, points, normals, values)
         return cls(nodes, has_plane, points, normals, *values)
 
     def bright_albedo(self) -> float:
@@ -288,18 +277,10 @@ class OffscreenCells:
         border = surfaces.has_plane & (surfaces.albedo > 0)
         border[_BORDER:-_BORDER, _BORDER:-_BORDER] = False
         out = np.empty((len(self.rays), 9), np.float32)
+        areas, of_border = self.fraction * self.pitch.prod(), surfaces.albedo[border] / gain
+        cells = self.rays, areas, self.planes, self.albedo / gain
         count = kernels.offscreen_sources(
-            self.rays,
-            self.fraction * self.pitch.prod(),
-            self.planes,
-            self.albedo / gain,
-            surfaces.nodes[border],
-            surfaces.albedo[border] / gain,
-            _INVERSE_DEPTH_RATIO,
-            FALLOFF,
-            MIN_COSINE,
-            wave_number,
-            out,
+            *cells, surfaces.nodes[border], of_border, wave_number, out
         )
         return out[:count]
 

@@ -7,7 +7,7 @@ import numpy as np
 from tofuse.engine.arrays import Complex128, Float32
 from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
 from tofuse.engine.sensor.multipath import ToFImage
-from tofuse.engine.sensor.multipath_surfaces import FALLOFF
+from tofuse.engine.sensor.multipath_kernels import FALLOFF
 
 # Longest ambiguity range of cameras with a single frequency. Longer ones are the beat of several
 # frequencies, from which the measured phases can't be recovered.

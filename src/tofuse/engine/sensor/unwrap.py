@@ -294,12 +294,8 @@ def _shift_surfaces(
         )
         count, surface = connected_components(graph, directed=False)
         crossing = surface[a] != surface[b]
-        surface_a, surface_b, boundary_difference, boundary_cost = (
-            surface[a][crossing],
-            surface[b][crossing],
-            difference[crossing],
-            edge_cost[crossing],
-        )
+        surface_a, surface_b = surface[a][crossing], surface[b][crossing]
+        at_boundary, boundary_cost = difference[crossing], edge_cost[crossing]
         gain, moves = np.zeros(count), np.zeros(count, np.intp)
         for shift in shifts:
             shifted = periods + shift
@@ -307,16 +303,9 @@ def _shift_surfaces(
             change = costs[np.arange(index.size), np.clip(shifted, 0, max_periods)]
             change = change - costs[np.arange(index.size), periods]
             total = np.bincount(surface, np.where(valid, change, 0), count)
-            total += np.bincount(
-                surface_a,
-                difference_cost(boundary_difference - shift * period) - boundary_cost,
-                count,
-            )
-            total += np.bincount(
-                surface_b,
-                difference_cost(boundary_difference + shift * period) - boundary_cost,
-                count,
-            )
+            for of_side, moved in ((surface_a, -shift * period), (surface_b, shift * period)):
+                cost = difference_cost(at_boundary + moved) - boundary_cost
+                total += np.bincount(of_side, cost, count)
             total[surface[valid & ~allowed]] = np.inf
             better = -total > gain + 1e-6
             gain[better], moves[better] = -total[better], shift
@@ -353,12 +342,7 @@ def _reset_isolated(blocks: _Blocks, best: Intp, period: float, options: UnwrapO
 
 
 def _upsample(
-    radial_range: Float32,
-    blocks: _Blocks,
-    best: Intp,
-    period: float,
-    side: int,
-    max_periods: int,
+    radial_range: Float32, blocks: _Blocks, best: Intp, period: float, side: int, max_periods: int
 ) -> Int32:
     """Return the wrap count (H, W) of pixels: that of the adjacent block closest in range."""
     height, width = radial_range.shape

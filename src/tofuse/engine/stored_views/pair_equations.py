@@ -8,7 +8,7 @@ pair are estimated from its residuals.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -91,10 +91,12 @@ class RefineOptions:
 
 @dataclass(eq=False)
 class DirectedPairs:
-    """Directed pairs, the scales of each, and its latest normal equations.
+    """Directed pairs of views, the scales of each, and its latest normal equations.
 
     Attributes
     ----------
+    views, options
+        As for `joint_alignment.refine`.
     target, source
         (P,) positions of the views.
     exposure, scale_g, scale_p
@@ -110,6 +112,8 @@ class DirectedPairs:
         (P, PATCHES, PATCH_SIZE) the same sums for each patch of the target; empty unless needed.
     """
 
+    views: Sequence[SampledView]
+    options: RefineOptions
     target: Intp
     source: Intp
     exposure: Float64
@@ -120,17 +124,36 @@ class DirectedPairs:
     rows: Float64 = field(default_factory=lambda: np.zeros((0, kernels.SIZE)))
     sums: Float64 = field(default_factory=lambda: np.zeros((0, 0, kernels.PATCH_SIZE)))
 
+    @classmethod
+    def of(
+        cls,
+        views: Sequence[SampledView],
+        pairs: Intp,
+        options: RefineOptions,
+        scales: Float64 | None = None,
+    ) -> DirectedPairs:
+        """Return both directions of each pair (M, 2), with `scales` of `KnownScales.of`, if any."""
+        target, source = _both_directions(pairs)
+        max_scale = np.maximum(3.0, options.max_sigma_m / np.array([v.sigma for v in views]))
+        scales = np.tile(_USUAL_SCALES, (len(target), 1)) if scales is None else scales
+        exposure, scale_g, scale_p = scales.T.copy()
+        photometric = np.array([v.has_albedo for v in views]) & options.photometric
+        scale_p[~(photometric[target] & photometric[source])] = 0.0
+        sources = _sources(views, by_patch=options.shared > 0 and bool(photometric.any()))
+        max_scale = max_scale[source]
+        return cls(views, options, target, source, exposure, scale_g, scale_p, max_scale, sources)
+
     def subset(self, which: Intp) -> DirectedPairs:
-        """Return a subset of the pairs, without their normal equations."""
+        """Return a subset of the pairs, which is yet to be evaluated."""
         exposure, scale_g, scale_p = (column[which] for column in self._scales())
-        return DirectedPairs(
-            self.target[which],
-            self.source[which],
-            exposure,
-            scale_g,
-            scale_p,
-            self.max_scale[which],
-            self.sources,
+        return replace(
+            self,
+            target=self.target[which],
+            source=self.source[which],
+            exposure=exposure,
+            scale_g=scale_g,
+            scale_p=scale_p,
+            max_scale=self.max_scale[which],
         )
 
     @property
@@ -145,6 +168,144 @@ class DirectedPairs:
 
     def _scales(self) -> tuple[Float64, Float64, Float64]:
         return self.exposure, self.scale_g, self.scale_p
+
+    def evaluate(
+        self,
+        poses: Float64,
+        errors: Float64,
+        fixed_errors: Int64,
+        stage: Round,
+        *,
+        by_patch: bool = False,
+    ) -> None:
+        """Sum the normal equations of every directed pair: replace `rows` and `sums`.
+
+        Parameters
+        ----------
+        poses
+            (N, 4, 4) T_world_camera.
+        errors, fixed_errors
+            (ERRORS,) errors of the camera, and mask: 0 for those that are estimated, else 1.
+        stage
+            Noise inflation.
+        by_patch
+            Whether to sum over patches as well, for `discount_shared`.
+        """
+        views, options = self.views, self.options
+        order, targets, ends = by_target(self.target)
+        target, source = self.target[order], self.source[order]
+        exposure, scale_g, scale_p = (column[order] for column in self._scales())
+        T_target_source = se3.inverse(poses[target]) @ poses[source]
+        rows = np.empty((len(target), kernels.SIZE))
+        sums = np.empty((len(rows), shared_error.PATCHES if by_patch else 0, kernels.PATCH_SIZE))
+        cosine = float(np.cos(options.max_angle))
+
+        def work(a: int, b: int) -> None:
+            for first in range(a, b, kernels.TARGETS):
+                last = min(first + kernels.TARGETS, b)
+                used = [views[k] for k in targets[first:last]]
+                images = [view.target_image for view in used]
+                images += images[-1:] * (kernels.TARGETS - len(images))
+                pairs = slice(ends[first], ends[last])
+                kernels.target_equations(
+                    self.sources,
+                    source[pairs],
+                    tuple(images),
+                    kernels.TargetViews(
+                        np.array([view.measures_range for view in used]),
+                        np.array([view.target_scale for view in used]),
+                        ends[first : last + 1] - ends[first],
+                    ),
+                    T_target_source[pairs],
+                    kernels.PairResiduals(
+                        exposure[pairs],
+                        scale_g[pairs],
+                        scale_p[pairs],
+                        stage.inflation_m,
+                        options.robust,
+                        cosine,
+                    ),
+                    errors,
+                    fixed_errors,
+                    rows[pairs],
+                    sums[pairs],
+                )
+
+        run_chunks(work, len(targets), -(-len(rows) // _PAIRS_A_CHUNK))
+        self.rows, self.sums = np.empty_like(rows), np.empty_like(sums)
+        self.rows[order], self.sums[order] = rows, sums
+
+    @property
+    def depends_on_patches(self) -> bool:
+        """Whether errors that patches share are modelled.
+
+        Only if there are photometric residuals: without them no more accurate residuals remain.
+        """
+        return self.options.shared > 0 and bool((self.scale_p > 0).any())
+
+    def discount_shared(self, poses: Float64) -> None:
+        """Remove the contribution of depth errors that patches share from the normal equations.
+
+        `poses` (N, 4, 4) are those of the last `evaluate` with `by_patch`. See `shared_error`.
+        """
+        photometric = np.flatnonzero(self.scale_p > 0)
+        T = se3.inverse(poses[self.target[photometric]]) @ poses[self.source[photometric]]
+        depth = np.array([v.depth for v in self.views])[self.target[photometric]]
+        growth = shared_error.growth(depth, se3.angle(T), np.linalg.norm(T[:, :3, 3], axis=1))
+        # Views of one recording come from one camera: their patches are correlated in the same way.
+        correlation = shared_error.patch_correlation(self.views[0].shape)
+        sampled_rows = np.arange(0, len(photometric), -(-len(photometric) // _PAIRS_SAMPLED))
+        sampled = photometric[sampled_rows]
+        disagreement = shared_error.disagreement(
+            self.sums[sampled], self.rows[sampled], correlation
+        )
+        variance = self.options.shared**2 * disagreement.variance(growth[sampled_rows]) * growth
+        if not variance.any():
+            return
+
+        def work(a: int, b: int) -> None:
+            marginalise_shared_errors(
+                self.sums, correlation, variance[a:b], photometric[a:b], self.rows
+            )
+
+        run_chunks(work, len(photometric), -(-len(photometric) // _DISCOUNTED_A_CHUNK))
+
+    def without_exposure(self, errors: Sequence[int] = ()) -> tuple[Float64, Float64]:
+        """Return normal equations of pairs without their exposure, which is eliminated and updated.
+
+        Parameters
+        ----------
+        errors
+            E errors of the camera, by their number in `kernels`.
+
+        Returns
+        -------
+        (P, 6 + E, 6 + E) matrices and (P, 6 + E) gradients, of the right perturbation of
+        T_target_source and these errors.
+        """
+        kept = np.array([*range(6), *(7 + k for k in errors)], np.intp)
+        rows, e = self.rows, kernels.EXPOSURE
+        pivot = np.maximum(rows[:, _PRODUCT[e, e]], 1e-9)
+        gradient = rows[:, kernels.GRADIENT + e]
+        self.exposure -= np.clip(gradient / pivot, -0.3, 0.3)
+        coupling = rows[:, _PRODUCT[kept, e]]
+        ratio = coupling / pivot[:, None]
+        H = rows[:, _PRODUCT[np.ix_(kept, kept)]] - ratio[:, :, None] * coupling[:, None]
+        return H, rows[:, kernels.GRADIENT + kept] - ratio * gradient[:, None]
+
+    def rescale(self, stage: Round) -> None:
+        """Estimate the sigmas of each pair from its residuals, as the tracker does."""
+        counts = np.ascontiguousarray(self.rows[:, kernels.HISTOGRAM :])
+        enough = counts.sum(1) >= _MIN_COMPARED
+        distance_scale = np.empty(len(counts))
+        steps.scales_of_distances(counts, distance_scale)
+        self.scale_g[enough] = np.clip(distance_scale, 0.7, self.max_scale)[enough]
+        weight = self.rows[:, kernels.WEIGHT_P]
+        mean_square = self.rows[:, kernels.SQUARES_P] / np.maximum(weight, 1e-9)
+        albedo_scale = np.sqrt(mean_square / tukey.consistency(self.options.robust))
+        used = (weight > 0) & (self.scale_p > 0)
+        scale = np.clip(np.hypot(albedo_scale, stage.photometric_inflation), 0.005, 0.5)
+        self.scale_p[used] = scale[used]
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,26 +340,6 @@ def _both_directions(pairs: Intp) -> tuple[Intp, Intp]:
     return np.concatenate([i, j]), np.concatenate([j, i])
 
 
-def directed_pairs(
-    views: Sequence[SampledView],
-    pairs: Intp,
-    options: RefineOptions,
-    scales: Float64 | None = None,
-) -> DirectedPairs:
-    """Return both directions of each pair (M, 2), with `scales` as of `KnownScales.of`, if any.
-
-    `views` (N,) and `options` are as for `joint_alignment.refine`.
-    """
-    target, source = _both_directions(pairs)
-    max_scale = np.maximum(3.0, options.max_sigma_m / np.array([v.sigma for v in views]))
-    scales = np.tile(_USUAL_SCALES, (len(target), 1)) if scales is None else scales
-    exposure, scale_g, scale_p = scales.T.copy()
-    photometric = np.array([v.has_albedo for v in views]) & options.photometric
-    scale_p[~(photometric[target] & photometric[source])] = 0.0
-    sources = _sources(views, by_patch=options.shared > 0 and bool(photometric.any()))
-    return DirectedPairs(target, source, exposure, scale_g, scale_p, max_scale[source], sources)
-
-
 def _sources(views: Sequence[SampledView], *, by_patch: bool) -> kernels.SourcePoints:
     """Concatenated points of all views; a view that occurs several times is stored once."""
     unique = {id(v): v for v in views}
@@ -219,152 +360,3 @@ def _sources(views: Sequence[SampledView], *, by_patch: bool) -> kernels.SourceP
         # Views of one recording come from one camera.
         views[0].projection.lens if views else lens.UNDISTORTED,
     )
-
-
-def evaluate(
-    views: Sequence[SampledView],
-    poses: Float64,
-    errors: Float64,
-    fixed_errors: Int64,
-    state: DirectedPairs,
-    stage: Round,
-    options: RefineOptions,
-    *,
-    by_patch: bool = False,
-) -> None:
-    """Sum the normal equations of every directed pair into `state`.
-
-    Parameters
-    ----------
-    views
-        N views.
-    poses
-        (N, 4, 4) T_world_camera.
-    errors, fixed_errors
-        (ERRORS,) errors of the camera, and mask: 0 for those that are estimated, else 1.
-    state
-        Pairs and their scales; `rows` and `sums` are replaced.
-    stage, options
-        Noise inflation, and limits of the residuals.
-    by_patch
-        Whether to sum over patches as well, for `discount_shared`.
-    """
-    order, targets, ends = by_target(state.target)
-    target, source = state.target[order], state.source[order]
-    exposure, scale_g, scale_p = (column[order] for column in state._scales())
-    T_target_source = se3.inverse(poses[target]) @ poses[source]
-    rows = np.empty((len(target), kernels.SIZE))
-    sums = np.empty((len(rows), shared_error.PATCHES if by_patch else 0, kernels.PATCH_SIZE))
-    cosine = float(np.cos(options.max_angle))
-
-    def work(a: int, b: int) -> None:
-        for first in range(a, b, kernels.TARGETS):
-            last = min(first + kernels.TARGETS, b)
-            used = [views[k] for k in targets[first:last]]
-            images = [view.target_image for view in used]
-            images += images[-1:] * (kernels.TARGETS - len(images))
-            pairs = slice(ends[first], ends[last])
-            kernels.target_equations(
-                state.sources,
-                source[pairs],
-                tuple(images),
-                kernels.TargetViews(
-                    np.array([view.measures_range for view in used]),
-                    np.array([view.target_scale for view in used]),
-                    ends[first : last + 1] - ends[first],
-                ),
-                T_target_source[pairs],
-                kernels.PairResiduals(
-                    exposure[pairs],
-                    scale_g[pairs],
-                    scale_p[pairs],
-                    stage.inflation_m,
-                    options.robust,
-                    cosine,
-                ),
-                errors,
-                fixed_errors,
-                rows[pairs],
-                sums[pairs],
-            )
-
-    run_chunks(work, len(targets), -(-len(rows) // _PAIRS_A_CHUNK))
-    state.rows, state.sums = np.empty_like(rows), np.empty_like(sums)
-    state.rows[order], state.sums[order] = rows, sums
-
-
-def depends_on_patches(state: DirectedPairs, options: RefineOptions) -> bool:
-    """Return whether errors that patches share are modelled.
-
-    Only if there are photometric residuals: without them no more accurate residuals remain.
-    """
-    return options.shared > 0 and bool((state.scale_p > 0).any())
-
-
-def discount_shared(
-    views: Sequence[SampledView], poses: Float64, state: DirectedPairs, options: RefineOptions
-) -> None:
-    """Remove the contribution of depth errors that patches share from the normal equations.
-
-    `poses` (N, 4, 4) are those of the last `evaluate` with `by_patch`. See `shared_error`.
-    """
-    photometric = np.flatnonzero(state.scale_p > 0)
-    T = se3.inverse(poses[state.target[photometric]]) @ poses[state.source[photometric]]
-    depth = np.array([v.depth for v in views])[state.target[photometric]]
-    growth = shared_error.growth(depth, se3.angle(T), np.linalg.norm(T[:, :3, 3], axis=1))
-    # Views of one recording come from one camera: their patches are correlated in the same way.
-    correlation = shared_error.patch_correlation(views[0].shape)
-    sampled_rows = np.arange(0, len(photometric), -(-len(photometric) // _PAIRS_SAMPLED))
-    sampled = photometric[sampled_rows]
-    disagreement = shared_error.disagreement(state.sums[sampled], state.rows[sampled], correlation)
-    variance = options.shared**2 * disagreement.variance(growth[sampled_rows]) * growth
-    if not variance.any():
-        return
-
-    def work(a: int, b: int) -> None:
-        marginalise_shared_errors(
-            state.sums, correlation, variance[a:b], photometric[a:b], state.rows
-        )
-
-    run_chunks(work, len(photometric), -(-len(photometric) // _DISCOUNTED_A_CHUNK))
-
-
-def without_exposure(state: DirectedPairs, errors: Sequence[int] = ()) -> tuple[Float64, Float64]:
-    """Return normal equations of each pair without its exposure, which is eliminated and updated.
-
-    Parameters
-    ----------
-    state
-        The pairs, after `evaluate`.
-    errors
-        E errors of the camera, by their number in `kernels`.
-
-    Returns
-    -------
-    (P, 6 + E, 6 + E) matrices and (P, 6 + E) gradients, of the right perturbation of
-    T_target_source and these errors.
-    """
-    kept = np.array([*range(6), *(7 + k for k in errors)], np.intp)
-    rows, e = state.rows, kernels.EXPOSURE
-    pivot = np.maximum(rows[:, _PRODUCT[e, e]], 1e-9)
-    gradient = rows[:, kernels.GRADIENT + e]
-    state.exposure -= np.clip(gradient / pivot, -0.3, 0.3)
-    coupling = rows[:, _PRODUCT[kept, e]]
-    ratio = coupling / pivot[:, None]
-    H = rows[:, _PRODUCT[np.ix_(kept, kept)]] - ratio[:, :, None] * coupling[:, None]
-    return H, rows[:, kernels.GRADIENT + kept] - ratio * gradient[:, None]
-
-
-def rescale(state: DirectedPairs, stage: Round, options: RefineOptions) -> None:
-    """Estimate the sigmas of each pair from its residuals, as the tracker does."""
-    counts = np.ascontiguousarray(state.rows[:, kernels.HISTOGRAM :])
-    enough = counts.sum(1) >= _MIN_COMPARED
-    distance_scale = np.empty(len(counts))
-    steps.scales_of_distances(counts, distance_scale)
-    state.scale_g[enough] = np.clip(distance_scale, 0.7, state.max_scale)[enough]
-    weight = state.rows[:, kernels.WEIGHT_P]
-    mean_square = state.rows[:, kernels.SQUARES_P] / np.maximum(weight, 1e-9)
-    albedo_scale = np.sqrt(mean_square / tukey.consistency(options.robust))
-    used = (weight > 0) & (state.scale_p > 0)
-    scale = np.clip(np.hypot(albedo_scale, stage.photometric_inflation), 0.005, 0.5)
-    state.scale_p[used] = scale[used]

@@ -482,11 +482,7 @@ def candidate_pairs(centroids: Float64, first: int = 0) -> tuple[Intp, Intp]:
 
 
 def _visible_fractions(
-    views: Sequence[HasCoarseView],
-    poses: Float64,
-    target: Intp,
-    source: Intp,
-    min_overlap: float,
+    views: Sequence[HasCoarseView], poses: Float64, target: Intp, source: Intp, min_overlap: float
 ) -> Float64:
     """Fraction of each source's points that its target observes; 0 if below `min_overlap`."""
     used, row = np.unique(source, return_inverse=True)

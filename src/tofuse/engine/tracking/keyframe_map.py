@@ -168,11 +168,7 @@ class Relocalizer:
         self._budget += 1 / _FRAMES_PER_SEARCH
 
     def links(
-        self,
-        view: PreparedView,
-        keyframes: KeyframeMap,
-        component: int,
-        last: int | None = None,
+        self, view: PreparedView, keyframes: KeyframeMap, component: int, last: int | None = None
     ) -> tuple[Link, ...]:
         """Register a view to keyframes of other components, up to the first certain link.
 

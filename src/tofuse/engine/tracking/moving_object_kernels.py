@@ -29,7 +29,31 @@ AMBIGUOUS = 4  # within the registration error of a depth edge of either view
 
 Rows = tuple[float, ...]
 
-_EDGE_SIGMAS = 4.0  # smallest difference between neighbouring depths at an edge
+# Standard deviation of the errors of a depth besides its noise, as a fraction: the accuracy in data
+# sheets of depth cameras.
+_MODEL_ERROR = 0.005
+# Neighbours are on a depth edge if their depths differ by more than this fraction, and than this
+# multiple of their noise.
+EDGE_JUMP, _EDGE_SIGMAS = 0.04, 4.0
+# Maximum misregistration of views besides noise, in pixels of the prepared view: a point is in
+# front of the other view's surface, or behind it, only if it is so for all pixels within it.
+_MISREGISTRATION = 2
+# Probability that a comparison of a static pixel is wrong for reasons other than noise. Limits the
+# evidence of one frame.
+_OUTLIERS = 0.05
+MAX_EVIDENCE = -float(np.log(_OUTLIERS))
+# Probability that a moving pixel agrees with the keyframe nevertheless: the object still overlaps
+# itself. Limits the evidence of one frame that agrees; where the keyframe's surface is known to
+# move, the evidence is reduced by this factor.
+_SELF_OVERLAP = 0.3
+_MAX_AGREEMENT = -float(np.log(_SELF_OVERLAP))
+# Prior probability that a pixel moves, and its log-odds.
+_PRIOR = 0.05
+PRIOR_ODDS = float(np.log(_PRIOR / (1 - _PRIOR)))
+# Fraction of its depth by which the surface at a pixel may move between frames.
+MAX_MOTION = 0.05
+# Dilation of a predicted mask, in cells of the previous view, and by a fraction of its depth.
+_DILATION, _MAX_DISTANCE = 3, 2 * MAX_MOTION
 
 
 class View(NamedTuple):
@@ -74,32 +98,6 @@ class Cells(NamedTuple):
     odds: Float32
     moving: Bool
     tracked: UInt8
-
-
-class Limits(NamedTuple):
-    """Limits of the evidence from comparing cells.
-
-    Attributes
-    ----------
-    model_error
-        Sigma of systematic errors, as a fraction of the depth.
-    edge_jump
-        Relative difference between neighbouring depths above which there is an edge.
-    radius
-        Registration error of the views in pixels: a point is in front of the other view's surface,
-        or behind it, only if it is so for all pixels within this radius.
-    max_evidence, max_agreement
-        Upper limits of llr and of -llr.
-    flagged_weight
-        Factor of the llr of a cell that agrees with a moving one.
-    """
-
-    model_error: float
-    edge_jump: float
-    radius: int
-    max_evidence: float
-    max_agreement: float
-    flagged_weight: float
 
 
 # The following functions take scalars, as Numba counts references to each array that is passed. For
@@ -182,9 +180,7 @@ def _project_cell(
 
 
 @kernel
-def residual_ratios(
-    view: View, moving: Bool, step: int, other: View, T: Float64, model_error: float
-) -> Float32:
+def residual_ratios(view: View, moving: Bool, step: int, other: View, T: Float64) -> Float32:
     """Return absolute depth differences divided by their sigma, (N,), where both views have depth.
 
     Parameters
@@ -193,8 +189,6 @@ def residual_ratios(
         (rows, columns) cells that are known to move; they are left out.
     step
         Every `step`-th cell is used, in both directions.
-    model_error
-        As in `Limits`.
 
     The other parameters are those of `compare`.
     """
@@ -230,7 +224,7 @@ def residual_ratios(
             )
             if not z_obs > 0:
                 continue
-            total = variance + observed_variance + model_error * model_error * z_obs * z_obs
+            total = variance + observed_variance + _MODEL_ERROR * _MODEL_ERROR * z_obs * z_obs
             out[n] = abs(z_proj - z_obs) / np.sqrt(total)
             n += 1
     return out[:n]
@@ -243,7 +237,6 @@ def compare(
     other_moving: Bool,
     T: Float64,
     scale: float,
-    limits: Limits,
     outcome: UInt8,
     llr: Float32,
     start: int,
@@ -261,8 +254,6 @@ def compare(
         (4, 4) T_other_view.
     scale
         Factor of the sigmas.
-    limits
-        Of the evidence.
     outcome, llr
         (rows, columns) of cells, written: see above. For cells behind the other view's surface, llr
         is that of an object that has moved away in between.
@@ -274,10 +265,9 @@ def compare(
     other_z, other_sigma = other.z, other.sigma
     other_planes, other_variance = other.planes, other.plane_variance
     lookup, lookup_frame, other_stride = other.lookup, other.lookup_frame, other.stride
-    model_error, edge_jump, radius, max_evidence, max_agreement, flagged_weight = limits
-    motion = rows_of(T)
+    motion, radius = rows_of(T), _MISREGISTRATION
     rows, columns = other_z.shape
-    model2, scale2 = model_error * model_error, scale * scale
+    model2, scale2 = _MODEL_ERROR * _MODEL_ERROR, scale * scale
     window = (2 * radius + 1) * (2 * radius + 1)
     for a in range(start, stop):
         for b in range(outcome.shape[1]):
@@ -307,9 +297,9 @@ def compare(
             d = z_proj - z_obs
             if d * d <= gate * total:
                 outcome[a, b] = AGREES
-                llr[a, b] = max(0.5 * (d * d / total - gate), -max_agreement)
+                llr[a, b] = max(0.5 * (d * d / total - gate), -_MAX_AGREEMENT)
                 if other_moving[k // other_stride, m // other_stride]:
-                    llr[a, b] *= flagged_weight
+                    llr[a, b] *= _SELF_OVERLAP
                 continue
             outcome[a, b] = AMBIGUOUS
             low, high, missing = np.inf, 0.0, 0
@@ -329,10 +319,10 @@ def compare(
                     if z[p, q] > 0:
                         low = min(low, np.float64(z[p, q]))
                         high = max(high, np.float64(z[p, q]))
-            if high - low > max(edge_jump * depth, _EDGE_SIGMAS * np.sqrt(scaled_variance)):
+            if high - low > max(EDGE_JUMP * depth, _EDGE_SIGMAS * np.sqrt(scaled_variance)):
                 continue
             outcome[a, b] = IN_FRONT if d < 0 else BEHIND
-            llr[a, b] = min(0.5 * (d * d / total - gate), max_evidence)
+            llr[a, b] = min(0.5 * (d * d / total - gate), MAX_EVIDENCE)
 
 
 @kernel
@@ -341,8 +331,6 @@ def propagate(
     prev: View,
     prev_cells: Cells,
     T: Float64,
-    tolerance: float,
-    prior: float,
     depths: Float32,
     odds: Float32,
     tracked: UInt8,
@@ -358,10 +346,6 @@ def propagate(
         The view, the previous view, and the cells of the latter.
     T
         (4, 4) T_prev_view.
-    tolerance
-        Fraction of its depth by which a surface may have moved in between.
-    prior
-        Log-odds of newly seen cells.
     depths, odds, tracked, in_free_space
         (rows, columns) of cells, written. `in_free_space`: the cell lies in free space of the
         previous view.
@@ -377,7 +361,7 @@ def propagate(
     for a in range(start, stop):
         for b in range(odds.shape[1]):
             i, j = a * stride, b * stride
-            odds[a, b], tracked[a, b], in_free_space[a, b] = prior, 0, False
+            odds[a, b], tracked[a, b], in_free_space[a, b] = PRIOR_ODDS, 0, False
             depth, variance = cell_depth(
                 planes[i, j, 3], plane_variance[i, j], z[i, j], sigma[i, j]
             )
@@ -390,7 +374,7 @@ def propagate(
                 continue
             k, m = k // prev_stride, m // prev_stride
             z_prev = np.float64(prev_depth[k, m])
-            max_difference = max(tolerance * z_proj, _EDGE_SIGMAS * np.sqrt(variance))
+            max_difference = max(MAX_MOTION * z_proj, _EDGE_SIGMAS * np.sqrt(variance))
             if z_prev > 0 and abs(z_proj - z_prev) <= max_difference:
                 odds[a, b], tracked[a, b] = prev_odds[k, m], prev_tracked[k, m]
             else:  # an object that moves with the camera stays at its place in the image
@@ -398,28 +382,18 @@ def propagate(
                 if (
                     k >= 0
                     and prev_moving[k, m]
-                    and abs(prev_depth[k, m] - depth) <= tolerance * depth
+                    and abs(prev_depth[k, m] - depth) <= MAX_MOTION * depth
                 ):
                     odds[a, b] = prev_odds[k, m]
             in_free_space[a, b] = z_prev > z_proj + max_difference
 
 
 @kernel
-def predict(
-    view: View,
-    prev: View,
-    prev_cells: Cells,
-    T: Float64,
-    tolerance: float,
-    radius: int,
-    moving: Bool,
-) -> None:
+def predict(view: View, prev: View, prev_cells: Cells, T: Float64, moving: Bool) -> None:
     """Mark cells that are near, in image and depth, to moving cells of the previous view.
 
     Parameters
     ----------
-    radius
-        In cells of the previous view.
     moving
         (rows, columns) of cells, written.
 
@@ -441,21 +415,15 @@ def predict(
             if k < 0:
                 continue
             k, m = k // prev_stride, m // prev_stride
-            moving[a, b] = _is_near_moving(k, m, z_proj, prev_depth, prev_moving, tolerance, radius)
+            moving[a, b] = _is_near_moving(k, m, z_proj, prev_depth, prev_moving)
             if not moving[a, b]:  # an object may move with the camera
                 k, m = _cell_on_ray(rays[i, j], prev_shape, prev_stride, lookup, lookup_frame)
-                moving[a, b] = k >= 0 and _is_near_moving(
-                    k, m, depth, prev_depth, prev_moving, tolerance, radius
-                )
+                moving[a, b] = k >= 0 and _is_near_moving(k, m, depth, prev_depth, prev_moving)
 
 
 @kernel
 def _cell_on_ray(
-    ray: Float32,
-    shape: tuple[int, int],
-    stride: int,
-    lookup: Float32,
-    lookup_frame: Float64,
+    ray: Float32, shape: tuple[int, int], stride: int, lookup: Float32, lookup_frame: Float64
 ) -> tuple[int, int]:
     """Return row and column of the cell that a ray projects to; -1 outside the image."""
     k, m = projection_kernels.nearest_pixel(
@@ -465,18 +433,11 @@ def _cell_on_ray(
 
 
 @kernel
-def _is_near_moving(
-    k: int,
-    m: int,
-    depth: float,
-    prev_depth: Float32,
-    prev_moving: Bool,
-    tolerance: float,
-    radius: int,
-) -> bool:
-    """Whether a moving cell lies within `radius` of cell (k, m), at a similar depth."""
+def _is_near_moving(k: int, m: int, depth: float, prev_depth: Float32, prev_moving: Bool) -> bool:
+    """Whether a moving cell lies near cell (k, m), at a similar depth."""
+    radius = _DILATION
     for p in range(max(k - radius, 0), min(k + radius + 1, prev_depth.shape[0])):
         for q in range(max(m - radius, 0), min(m + radius + 1, prev_depth.shape[1])):
-            if prev_moving[p, q] and abs(prev_depth[p, q] - depth) <= tolerance * depth:
+            if prev_moving[p, q] and abs(prev_depth[p, q] - depth) <= _MAX_DISTANCE * depth:
                 return True
     return False

@@ -29,38 +29,16 @@ from tofuse.engine.views import PreparedView
 # The image is divided into cells of n x n pixels, in at most this number of columns; one pixel of
 # each is compared.
 _COLUMNS = 112
-# Standard deviation of the errors of a depth besides its noise, as a fraction: the accuracy in data
-# sheets of depth cameras.
-_MODEL_ERROR = 0.005
-# Neighbours whose depths differ by more than this fraction are on a depth edge.
-_EDGE_JUMP = 0.04
-# Maximum misregistration of views besides noise, in pixels of the prepared view.
-_MISREGISTRATION = 2
-# Probability that a comparison of a static pixel is wrong for reasons other than noise. Limits the
-# evidence of one frame.
-_OUTLIERS = 0.05
-_MAX_EVIDENCE = -float(np.log(_OUTLIERS))
-# Probability that a moving pixel agrees with the keyframe nevertheless: the object still overlaps
-# itself. Limits the evidence of one frame that agrees; where the keyframe's surface is known to
-# move, the evidence is reduced by this factor.
-_SELF_OVERLAP = 0.3
-# Prior probability that a pixel moves, and its log-odds.
-_PRIOR = 0.05
-_PRIOR_ODDS = float(np.log(_PRIOR / (1 - _PRIOR)))
 # Factor per frame of the difference of the log-odds from their prior: evidence decays.
 _DECAY = 0.95
 # Log-odds beyond which a pixel is segmented, and beyond which it is if connected to such a pixel.
 # An isolated pixel needs two frames with full evidence to reach the first.
 _DETECT, _EXTEND = 1.5, -0.5
 # Log-odds of all pixels of a segment.
-_CORE = _DETECT + 0.5 * _MAX_EVIDENCE
+_CORE = _DETECT + 0.5 * kernels.MAX_EVIDENCE
 # Fraction of the pixels of a segment that must be beyond `_DETECT`, and the smallest segment, as a
 # fraction of the image.
 _MIN_CORE, _MIN_SIZE = 0.25, 0.004
-# Fraction of its depth by which the surface at a pixel may move between frames.
-_MAX_MOTION = 0.05
-# Dilation of a predicted mask, in cells.
-_DILATION = 3
 # Minimum fraction of the comparisons outside of the mask that agree, for a pair of views to be
 # evidence of motion. Below, a wrong pose is as likely.
 _MIN_AGREEMENT = 0.5
@@ -81,14 +59,6 @@ _MIN_RESIDUALS = 50
 # wrong pose must not be taken for noise.
 _SCALE_WINDOW, _MAX_SCALE_RATIO = 31, 3.0
 _NEIGHBOURS = np.ones((3, 3), np.uint8)
-_LIMITS = kernels.Limits(
-    _MODEL_ERROR,
-    _EDGE_JUMP,
-    _MISREGISTRATION,
-    _MAX_EVIDENCE,
-    max_agreement=-float(np.log(_SELF_OVERLAP)),
-    flagged_weight=_SELF_OVERLAP,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +100,7 @@ class Moving:
         moving objects are not segmented yet.
     scale
         Robust scale of the residuals outside of the previous mask, in sigmas of noise and
-        `_MODEL_ERROR`.
+        systematic errors.
     reliable
         Whether the pair agreed enough for its disagreements to be counted as motion. If not, the
         masks are propagated from earlier frames.
@@ -253,15 +223,7 @@ class MovingObjects:
         stride = stride_of(view)
         moving = np.empty(_cell_shape(shape, stride), np.bool_)
         T = np.ascontiguousarray(se3.inverse(last.T_world_camera) @ T_world_camera_predicted)
-        kernels.predict(
-            _sampled(view),
-            _sampled(last.view),
-            last.cells,
-            T,
-            2 * _MAX_MOTION,
-            _DILATION,
-            moving,
-        )
+        kernels.predict(_sampled(view), _sampled(last.view), last.cells, T, moving)
         return _pixels(moving, shape, stride)
 
     def reference_mask(self, reference: PreparedView) -> Bool:
@@ -320,7 +282,7 @@ class MovingObjects:
             reference_evidence[reference_outcome == kernels.BEHIND] = 0
             # The last view observed free space there; the reference adds evidence only if in front.
             arrived_only = arrived & (outcome != kernels.IN_FRONT)
-            evidence[arrived_only] += np.float32(_MAX_EVIDENCE)
+            evidence[arrived_only] += np.float32(kernels.MAX_EVIDENCE)
             cells = self._updated(cells, evidence)
             reference_cells = self._updated(reference_cells, reference_evidence)
             tracked = np.where(outcome == kernels.AGREES, np.uint8(1), tracked)
@@ -379,7 +341,7 @@ class MovingObjects:
         if cells is None or cells.odds.shape != shape:
             stride = stride_of(reference)
             depth = np.ascontiguousarray(reference.z[::stride, ::stride])
-            odds = np.full(shape, _PRIOR_ODDS, np.float32)
+            odds = np.full(shape, kernels.PRIOR_ODDS, np.float32)
             cells = kernels.Cells(depth, odds, np.zeros(shape, np.bool_), np.zeros(shape, np.uint8))
         return cells
 
@@ -413,7 +375,7 @@ class MovingObjects:
 
         def work(a: int, b: int) -> None:
             kernels.propagate(
-                sampled, sampled_previous, last_cells, T, _MAX_MOTION, _PRIOR_ODDS,
+                sampled, sampled_previous, last_cells, T,
                 depth, odds, tracked, arrived, a, b,
             )  # fmt: skip
 
@@ -425,15 +387,15 @@ class MovingObjects:
     ) -> float:
         """Return the robust scale of the residuals between two views, in sigmas."""
         ratios = kernels.residual_ratios(
-            _sampled(view), moving, _SCALE_EVERY, _sampled(reference), T, _MODEL_ERROR
+            _sampled(view), moving, _SCALE_EVERY, _sampled(reference), T
         )
         return _robust_scale(ratios)
 
     def _updated(self, cells: kernels.Cells, evidence: Float32) -> kernels.Cells:
         """Add the evidence of a pair of views."""
-        prior = np.float32(_PRIOR_ODDS)
+        prior = np.float32(kernels.PRIOR_ODDS)
         odds = prior + np.float32(_DECAY) * (cells.odds - prior) + evidence
-        max_odds = _DETECT + 2 * _MAX_EVIDENCE
+        max_odds = _DETECT + 2 * kernels.MAX_EVIDENCE
         return cells._replace(odds=np.clip(odds, 2 * prior, max_odds).astype(np.float32))
 
     def _segmented(self, cells: kernels.Cells, evidence: Float32, detect: float) -> kernels.Cells:
@@ -463,9 +425,9 @@ class MovingObjects:
         near_depth = cv2.dilate(np.where(moving, depth, np.float32(0)), _NEIGHBOURS, iterations=2)
         dilated = cv2.dilate(moving.view(np.uint8), _NEIGHBOURS) > 0
         dilated |= (near_depth > 0) & (
-            np.abs(near_depth - depth) <= np.float32(_MAX_MOTION) * near_depth
+            np.abs(near_depth - depth) <= np.float32(kernels.MAX_MOTION) * near_depth
         )
-        moving = moving | (dilated & (evidence >= 0) & (odds >= _PRIOR_ODDS))
+        moving = moving | (dilated & (evidence >= 0) & (odds >= kernels.PRIOR_ODDS))
         return cells._replace(odds=odds, moving=moving)
 
     def _completed(self, moving: Bool, depth: Float32) -> Bool:
@@ -473,7 +435,7 @@ class MovingObjects:
 
         Where an object still overlaps itself, it agrees with the reference.
         """
-        jump = np.float32(0.5 * _EDGE_JUMP)
+        jump = np.float32(0.5 * kernels.EDGE_JUMP)
         interior = depth > 0
         for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
             interior[a] &= np.abs(depth[a] - depth[b]) <= jump * depth[b]
@@ -486,11 +448,7 @@ class MovingObjects:
 
 
 def compared(
-    view: PreparedView,
-    other: PreparedView,
-    other_moving: Bool,
-    T_other_view: Float64,
-    scale: float,
+    view: PreparedView, other: PreparedView, other_moving: Bool, T_other_view: Float64, scale: float
 ) -> tuple[UInt8, Float32]:
     """Return outcomes and log-likelihood ratios of the cells of a view, against another one.
 
@@ -511,8 +469,7 @@ def compared(
 
     def work(a: int, b: int) -> None:
         kernels.compare(
-            sampled, sampled_other, other_moving, T_other_view, scale, _LIMITS,
-            outcome, llr, a, b,
+            sampled, sampled_other, other_moving, T_other_view, scale, outcome, llr, a, b,
         )  # fmt: skip
 
     run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))

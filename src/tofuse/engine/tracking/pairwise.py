@@ -128,7 +128,8 @@ class _SequentialTracker(Tracker):
 
     def _guess(self, last: _Tracked, T_odometry: Float64 | None) -> Float64:
         if self._options.guess == "odometry":
-            return _odometry_motion(last, T_odometry)
+            motion = _odometry_motion(last.T_odometry, T_odometry)
+            return np.eye(4) if motion is None else motion
         return self._motion if self._options.guess == "previous" else np.eye(4)
 
 
@@ -136,12 +137,12 @@ def _lost(reason: str, last: _Tracked | None = None) -> Step:
     return Step("lost", reason, None, None if last is None else last.frame.index)
 
 
-def _odometry_motion(last: _Tracked, T_odometry: Float64 | None) -> Float64:
-    before = last.T_odometry
-    if before is None or T_odometry is None:
-        return np.eye(4)
-    motion = se3.inverse(before) @ T_odometry
-    return motion if np.isfinite(motion).all() else np.eye(4)
+def _odometry_motion(before: Float64 | None, now: Float64 | None) -> Float64 | None:
+    """Return the motion (4, 4) between two poses of odometry; None if one is unknown."""
+    if before is None or now is None:
+        return None
+    motion = se3.inverse(before) @ now
+    return motion if np.isfinite(motion).all() else None
 
 
 @part("odometry", "pairwise")
@@ -271,11 +272,9 @@ class _PairwiseTracker(Tracker):
         guess = np.eye(4) if T is None else se3.inverse(last.T_component_view) @ T
         if self._options.guess == "identity":
             guess = np.eye(4)
-        before, now_at = last.T_odometry, self._T_odometry
-        if self._options.guess == "odometry" and before is not None and now_at is not None:
-            motion = se3.inverse(before) @ now_at
-            if np.isfinite(motion).all():
-                guess, self._has_odometry = motion, True
+        motion = _odometry_motion(last.T_odometry, self._T_odometry)
+        if self._options.guess == "odometry" and motion is not None:
+            guess, self._has_odometry = motion, True
         return self._registered(frame, last, guess, self._local_registration)
 
     def _confirmed_by_odometry(

@@ -198,10 +198,8 @@ class Selection:
         A doubtful reference counts only if there is no other: its own pose may follow a moving
         object.
         """
-        T, options = (
-            hypothesis.T_component_camera,
-            verification.fine_tolerances(self._state.fit_statistics),
-        )
+        T = hypothesis.T_component_camera
+        options = verification.fine_tolerances(self._state.fit_statistics)
         references = [
             hypothesis.reference if r.keyframe is hypothesis.keyframe else r
             for r in self._hypotheses.references

@@ -35,8 +35,6 @@ _DEVIATION, _WINDOW = 0.01, 0.016
 # Pixels whose noise exceeds the typical one by this ratio get planes of their own, if they are at
 # least this fraction of a view.
 _NOISY_RATIO, _MIN_NOISY = 2.0, 0.02
-# Largest distance, in standard deviations, of a pixel that belongs to a plane.
-_MAX_PLANE_SIGMAS = 3.0
 
 
 def with_extended_planes(
@@ -111,7 +109,7 @@ def _with_planes_of_neighbours(
     planes, variance = surface.planes.copy(), surface.plane_variance.copy()
     extend_planes(
         w, noise * w, surface.rays, missing, typical_planes, surface.plane_variance, steps, growth,
-        _MAX_PLANE_SIGMAS, options.edge_jump, planes, variance,
+        options.edge_jump, planes, variance,
     )  # fmt: skip
     return replace(surface, planes=planes, plane_variance=variance)
 

@@ -253,12 +253,7 @@ def project_block(
 
 @kernel
 def compare_planes(
-    block: Float32,
-    T: Float64,
-    scale_g: float,
-    inflation: float,
-    robust: float,
-    min_cosine: float,
+    block: Float32, T: Float64, scale_g: float, inflation: float, robust: float, min_cosine: float
 ) -> None:
     """Compare the points of a block with the target planes; parameters as in `Residuals`."""
     r00, r01, r02 = np.float32(T[0, 0]), np.float32(T[0, 1]), np.float32(T[0, 2])

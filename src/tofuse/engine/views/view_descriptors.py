@@ -170,10 +170,8 @@ def _shifted(descriptors: Float32, v: int, u: int) -> Float32:
     """Return descriptors shifted by v rows and u columns."""
     shifted = np.full_like(descriptors, np.nan)
     to_rows, from_rows = slice(max(-v, 0), _ROWS - max(v, 0)), slice(max(v, 0), _ROWS + min(v, 0))
-    to_columns, from_columns = (
-        slice(max(-u, 0), _COLUMNS - max(u, 0)),
-        slice(max(u, 0), _COLUMNS + min(u, 0)),
-    )
+    to_columns = slice(max(-u, 0), _COLUMNS - max(u, 0))
+    from_columns = slice(max(u, 0), _COLUMNS + min(u, 0))
     shifted[:, :, to_rows, to_columns] = descriptors[:, :, from_rows, from_columns]
     return shifted
 

@@ -13,6 +13,7 @@ from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64
 from tofuse.engine.compute import kernel
 
 _SUMS = 12
+_MAX_SIGMAS = 3.0  # standard deviations of a pixel from a plane that it belongs to
 
 
 @kernel
@@ -465,7 +466,6 @@ def extend_planes(
     variance: Float32,
     offsets: Int32,
     variance_growth: Float32,
-    sigmas: float,
     jump: float,
     planes_out: Float32,
     variance_out: Float32,
@@ -483,15 +483,15 @@ def extend_planes(
     offsets, variance_growth
         (K, 2) rows and columns of the candidates relative to the pixel, in order of preference, and
         (K,) the factor by which the variance of their planes grows up to the pixel.
-    sigmas, jump
-        The pixel agrees with a plane if 1/z differs by at most `sigmas` standard deviations, 1/z of
-        the plane changes by at most the fraction `jump` between the two pixels, and the pixel's
-        sigma is at most twice the other one's, as a change of noise indicates another surface.
+    jump
+        The pixel agrees with a plane if 1/z differs by at most `_MAX_SIGMAS`, 1/z of the plane
+        changes by at most the fraction `jump` between the two pixels, and the pixel's sigma is at
+        most twice the other one's, as a change of noise indicates another surface.
     planes_out, variance_out
         (H, W, 4) and (H, W), written: planes, and the variances of their 1/z.
     """
     rows, columns = w.shape
-    limit = np.float32(sigmas * sigmas)
+    limit = np.float32(_MAX_SIGMAS * _MAX_SIGMAS)
     tolerance = np.float32(jump)
     for i in range(rows):
         for j in range(columns):

@@ -228,11 +228,7 @@ COUNTS_PER_M: dict[Layout, int] = {"tum": 5000, "open3d": 1000}
 _WHITE_PERCENTILE = 99.0  # of the amplitude that is shown as white
 
 
-def convert_to(
-    recording: Recording,
-    folder: str | Path,
-    layout: Layout,
-) -> Conversion:
+def convert_to(recording: Recording, folder: str | Path, layout: Layout) -> Conversion:
     """Write a recording's images in another layout.
 
     Both layouts support only pinhole cameras, z depth in counts of 0.2 mm (TUM) or 1 mm (Open3D),

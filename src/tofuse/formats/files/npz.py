@@ -23,10 +23,7 @@ _KINDS = "biufcSU"
 
 
 def read_npz(
-    path: str | Path,
-    *,
-    limit: int = _MAX_BYTES,
-    names: frozenset[str] | None = None,
+    path: str | Path, *, limit: int = _MAX_BYTES, names: frozenset[str] | None = None
 ) -> Arrays:
     """Return the arrays of a file, by name.
 

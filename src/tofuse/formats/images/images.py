@@ -210,11 +210,7 @@ def _npy_image(path: str | Path, size: tuple[int, int] | None) -> NDArray[Any]:
 
 
 def parse_image(
-    data: bytes,
-    path: str | Path,
-    *,
-    size: tuple[int, int] | None = None,
-    dtype: str | None = None,
+    data: bytes, path: str | Path, *, size: tuple[int, int] | None = None, dtype: str | None = None
 ) -> NDArray[Any]:
     """Decode a PNG, JPEG or PGM in memory; `path` names it in errors. See `read_image`."""
     with reading.about(path, _COPY_AGAIN):
@@ -254,11 +250,8 @@ def _decode(data: bytes, header: ImageHeader) -> NDArray[Any]:
 
     grey = header.channels < 3
     # The EXIF orientation of a phone would rotate the image relative to its depth.
-    flags = cv2.IMREAD_IGNORE_ORIENTATION | (
-        cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
-        if grey
-        else cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
-    )
+    flags = cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
+    flags |= cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR
     image = decoded(data, flags, (header.height, header.width))
     return image if grey else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
 

@@ -29,27 +29,13 @@ def read_tum(path: str | Path) -> tuple[Float64, Float64]:
     InputError
         Naming file and line, if a line isn't 8 numbers, or its pose can't be used.
     """
-    rows: list[list[float]] = []
-    numbers: list[int] = []
-    for number, cells in rows_of(reading.read_text(path)):
-        where = f"{path}, line {number}"
-        try:
-            row = [float(cell) for cell in cells]
-        except ValueError as error:
-            raise InputError(str(error), where=where, remedy=_TUM) from error
-        if len(row) != 8:
-            raise InputError(f"has {len(row)} numbers", where=where, remedy=_TUM)
-        if not np.isfinite(row[0]):
-            raise InputError("has a timestamp that is not finite", where=where, remedy=_TUM)
-        rows.append(row)
-        numbers.append(number)
-    table = np.array(rows, float).reshape(-1, 8)
-    poses = poses_of_rows(table[:, 4:], table[:, 1:4], path, numbers)
+    rows = list(rows_of(reading.read_text(path)))
+    with reading.about(path, "write 'timestamp tx ty tz qx qy qz qw'"):
+        table, lines = numbers_of_rows(rows, path, 8, exactly=True)
+        check_times(table[:, 0], path, lines)
+    poses = poses_of_rows(table[:, 4:], table[:, 1:4], path, lines)
     known = np.isfinite(poses[:, 0, 0])
     return table[known, 0], poses[known]
-
-
-_TUM = "write 'timestamp tx ty tz qx qy qz qw'"
 
 
 def rows_of(text: str) -> Iterator[tuple[int, list[str]]]:
@@ -58,6 +44,30 @@ def rows_of(text: str) -> Iterator[tuple[int, list[str]]]:
         cells = line.split("#", 1)[0].replace(",", " ").split()
         if cells:
             yield number, cells
+
+
+def numbers_of_rows(
+    rows: Sequence[tuple[int, list[str]]], path: str | Path, count: int, *, exactly: bool = False
+) -> tuple[Float64, list[int]]:
+    """Return the first numbers of rows, (N, count), and their lines."""
+    table = []
+    for number, cells in rows:
+        where = f"{path}, line {number}"
+        try:
+            table.append([float(cell) for cell in cells[:count]])
+        except ValueError as error:
+            raise InputError(str(error), where=where) from error
+        if len(cells) < count or (exactly and len(cells) > count):
+            needed = f"{count}" if exactly else f"{count} or more"
+            raise InputError(f"has {len(cells)} numbers, not {needed}", where=where)
+    return np.array(table, float).reshape(-1, count), [number for number, _ in rows]
+
+
+def check_times(times: Float64, path: str | Path, lines: Sequence[int]) -> None:
+    """Raise InputError for the first of the times (N,) of lines of a file that is not finite."""
+    if not np.isfinite(times).all():
+        line = lines[int(np.argmin(np.isfinite(times)))]
+        raise InputError("has a timestamp that is not finite", where=f"{path}, line {line}")
 
 
 def poses_of_rows(q_xyzw: Float64, t: Float64, path: str | Path, numbers: Sequence[int]) -> Float64:

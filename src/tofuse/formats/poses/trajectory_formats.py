@@ -20,7 +20,14 @@ from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.formats.files import npz, reading
-from tofuse.formats.poses.trajectory import associated_poses, poses_of_rows, read_tum, rows_of
+from tofuse.formats.poses.trajectory import (
+    associated_poses,
+    check_times,
+    numbers_of_rows,
+    poses_of_rows,
+    read_tum,
+    rows_of,
+)
 
 # Files with the poses in a folder; the first that exists is used.
 NAMES = ("trajectory.txt", "groundtruth.txt", "images.txt", "transforms.json", "trajectory.log")
@@ -155,21 +162,6 @@ def _tum(_rows: _Rows, path: Path) -> TimedPoses:
     return TimedPoses(poses, timestamps=times)
 
 
-def _numbers(rows: _Rows, path: Path, count: int) -> tuple[Float64, list[int]]:
-    """(N, count) first numbers of the rows, and their lines."""
-    table, lines = [], []
-    for number, cells in rows:
-        where = f"{path}, line {number}"
-        try:
-            table.append([float(cell) for cell in cells[:count]])
-        except ValueError as error:
-            raise InputError(str(error), where=where) from error
-        if len(cells) < count:
-            raise InputError(f"has {len(cells)} numbers, not {count} or more", where=where)
-        lines.append(number)
-    return np.array(table, float).reshape(-1, count), lines
-
-
 def _known(
     poses: Sequence[Float64] | Float64, timestamps: Float64 | None = None, frames: Any = None
 ) -> TimedPoses:
@@ -192,17 +184,15 @@ def _rigid(T: Float64, where: str) -> Float64:
 
 def _euroc(rows: _Rows, path: Path) -> TimedPoses:
     """Lines of ns, x y z, qw qx qy qz, and possibly more, as in EuRoC's ground truth."""
-    table, lines = _numbers(rows, path, 8)
+    table, lines = numbers_of_rows(rows, path, 8)
     poses = poses_of_rows(table[:, [5, 6, 7, 4]], table[:, 1:4], path, lines)
-    if not np.isfinite(table[:, 0]).all():
-        line = lines[int(np.argmin(np.isfinite(table[:, 0])))]
-        raise InputError("has a timestamp that is not finite", where=f"{path}, line {line}")
+    check_times(table[:, 0], path, lines)
     return _known(poses, timestamps=1e-9 * table[:, 0])
 
 
 def _kitti(rows: _Rows, path: Path) -> TimedPoses:
     """Lines of 3 x 4 matrices, one for each frame."""
-    table, lines = _numbers(rows, path, 12)
+    table, lines = numbers_of_rows(rows, path, 12)
     out = np.tile(np.eye(4), (len(rows), 1, 1))
     out[:, :3] = table.reshape(-1, 3, 4)
     poses = [_rigid(T, f"{path}, line {line}") for T, line in zip(out, lines, strict=True)]
@@ -217,7 +207,7 @@ def _log(rows: _Rows, path: Path) -> TimedPoses:
     for k in range(0, len(rows), 5):
         _, head = rows[k]
         where = f"{path}, pose {k // 5}"
-        table, _ = _numbers(rows[k + 1 : k + 5], path, 4)
+        table, _ = numbers_of_rows(rows[k + 1 : k + 5], path, 4)
         if not (head[0].isdecimal() and len(head[0]) <= _DIGITS):
             raise InputError(f"names frame {head[0][:40]!r}", where=where)
         poses.append(_rigid(table, where))
@@ -229,7 +219,7 @@ def _colmap(rows: _Rows, path: Path) -> TimedPoses:
     """COLMAP's images: id, qw qx qy qz, x y z of T_camera_world, camera, name; then its points."""
     # The second line of each image lists its points as triples, without a name in column 10.
     images = [(n, c) for n, c in rows if len(c) == 10 and not _is_number(c[9])]
-    table, lines = _numbers(images, path, 8)
+    table, lines = numbers_of_rows(images, path, 8)
     T_camera_world = poses_of_rows(table[:, [2, 3, 4, 1]], table[:, 5:8], path, lines)
     names = [cells[9] for _, cells in images]
     return _known(se3.inverse(T_camera_world), frames=_frame_numbers(names))

@@ -73,7 +73,7 @@ def _times(files: list[Path]) -> Float64:
 
 def _of_frames(folder: Path, suffix: str, times: Float64) -> list[Path | None]:
     """The file of each frame; None where there is none."""
-    files = reading.files_with(folder, suffix) if reading.is_folder(folder) else []
+    files = inputs.files_at(folder, suffix)
     nearest = associate(times, _times(files), limit=_LIMIT_S, exclusive=False)
     return [files[k] if k >= 0 else None for k in nearest]
 

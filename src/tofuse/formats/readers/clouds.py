@@ -16,37 +16,32 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
 from tofuse.formats.geometry import Pcd, read_pcd
-from tofuse.formats.sources import (
-    cloud_frames,
-    cloud_sequence,
-    inputs,
-    organised,
-)
+from tofuse.formats.sources import cloud_files, inputs, organised
 
 
 @part("reader", "ply", label="validated")
-class PlyClouds(cloud_sequence.CloudReader):
+class PlyClouds(cloud_files.CloudReader):
     """A .ply file, or a folder of them; metres."""
 
     suffixes = (".ply",)
 
-    def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
+    def source(self, path: Path, files: list[Path]) -> cloud_files.CloudFileSource:
         """See `CloudReader.source`."""
-        return cloud_sequence.CloudFileSource(path, files, cloud_frames.ply_frame, deproject=True)
+        return cloud_files.CloudFileSource(path, files, cloud_files.ply_frame, deproject=True)
 
 
 @part("reader", "pcd", label="validated")
-class PcdClouds(cloud_sequence.CloudReader):
+class PcdClouds(cloud_files.CloudReader):
     """A .pcd file, or a folder of them; images if organised; metres."""
 
     suffixes = (".pcd",)
 
-    def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
+    def source(self, path: Path, files: list[Path]) -> cloud_files.CloudFileSource:
         """See `CloudReader.source`."""
         camera = _camera(files)
         if camera is None:
-            return cloud_sequence.CloudFileSource(path, files, pcd_cloud, deproject=True)
-        source = cloud_sequence.CloudFileSource(
+            return cloud_files.CloudFileSource(path, files, pcd_cloud, deproject=True)
+        source = cloud_files.CloudFileSource(
             path, files, lambda file, index, time: pcd_image(file, index, time, camera)
         )
         source.metadata["depth_kind"] = "z"
@@ -56,7 +51,7 @@ class PcdClouds(cloud_sequence.CloudReader):
 def pcd_cloud(path: Path, index: int, timestamp: float) -> CloudFrame:
     """Read a file as a cloud; its viewpoint is the sensor's position."""
     pcd = read_pcd(path)
-    return cloud_frames.cloud_frame(index, timestamp, pcd.cloud, origin=pcd.viewpoint[:3])
+    return cloud_files.cloud_frame(index, timestamp, pcd.cloud, origin=pcd.viewpoint[:3])
 
 
 def pcd_image(path: Path, index: int, timestamp: float, camera: Camera) -> Frame:
@@ -84,14 +79,14 @@ def _camera(files: list[Path]) -> Camera | None:
 
 
 def _image(pcd: Pcd) -> Float32:
-    return cloud_frames.to_float32(pcd.cloud.points).reshape(pcd.height, pcd.width, 3)
+    return cloud_files.to_float32(pcd.cloud.points).reshape(pcd.height, pcd.width, 3)
 
 
 _SUFFIXES = (".xyz", ".xyzn", ".xyzrgb", ".asc", ".pts")
 
 
 @part("reader", "xyz")
-class XyzClouds(cloud_sequence.CloudReader):
+class XyzClouds(cloud_files.CloudReader):
     """A .xyz, .xyzn, .xyzrgb, .asc or .pts file, or a folder of them; metres.
 
     The fourth column of four is an amplitude. Columns four to six (of seven in .pts, after the
@@ -101,9 +96,9 @@ class XyzClouds(cloud_sequence.CloudReader):
 
     suffixes = _SUFFIXES
 
-    def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
+    def source(self, path: Path, files: list[Path]) -> cloud_files.CloudFileSource:
         """See `CloudReader.source`."""
-        return cloud_sequence.CloudFileSource(path, files, xyz_frame, deproject=True)
+        return cloud_files.CloudFileSource(path, files, xyz_frame, deproject=True)
 
 
 def xyz_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
@@ -119,11 +114,11 @@ def xyz_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
         if path.suffix.lower() == ".xyzrgb":
             color = np.clip(np.rint(np.nan_to_num(columns) * 255), 0, 255).astype(np.uint8)
         elif path.suffix.lower() == ".xyzn" or _are_unit(columns):
-            normals = cloud_frames.to_float32(columns)
+            normals = cloud_files.to_float32(columns)
         elif ((columns >= 0) & (columns <= 255) & (columns == np.rint(columns))).all():
             color = columns.astype(np.uint8)
     cloud = GeometryRecord(table[:, :3], None, normals, color, scalars=_fourth(table))
-    return cloud_frames.cloud_frame(index, timestamp, cloud)
+    return cloud_files.cloud_frame(index, timestamp, cloud)
 
 
 def _has_head(text: str) -> bool:
@@ -138,7 +133,7 @@ def _has_head(text: str) -> bool:
 def _fourth(table: Float64) -> dict[str, Float32]:
     """The last column of four, which is an amplitude."""
     four = table.shape[1] == 4
-    return {"amplitude": cloud_frames.to_float32(table[:, 3])} if four else {}
+    return {"amplitude": cloud_files.to_float32(table[:, 3])} if four else {}
 
 
 def _are_unit(vectors: Float64) -> bool:
@@ -152,14 +147,14 @@ CENTIMETRE = 0.01
 
 
 @part("reader", "slam6d", label="validated")
-class Slam6d(cloud_sequence.CloudReader):
+class Slam6d(cloud_files.CloudReader):
     """3DTK, slam6D: a folder of scanNNN.3d with scanNNN.pose."""
 
     suffixes = (".3d",)
 
-    def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
+    def source(self, path: Path, files: list[Path]) -> cloud_files.CloudFileSource:
         """See `CloudReader.source`."""
-        source = cloud_sequence.CloudFileSource(path, files, scan_frame)
+        source = cloud_files.CloudFileSource(path, files, scan_frame)
         poses = inputs.poses_from_files(
             source, [file.with_suffix(".pose") for file in files], read_pose
         )
@@ -185,7 +180,7 @@ def scan_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     # The scanner writes (0, 0, 0) for missing measurements.
     points[(points == 0).all(1)] = np.nan
     cloud = GeometryRecord(points, scalars=_fourth(table))
-    return cloud_frames.cloud_frame(index, timestamp, cloud)
+    return cloud_files.cloud_frame(index, timestamp, cloud)
 
 
 def read_pose(path: Path) -> Float64:

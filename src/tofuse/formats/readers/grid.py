@@ -19,15 +19,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
 from tofuse.formats.geometry import read_pcd, read_ply
-from tofuse.formats.sources import (
-    Reader,
-    ReaderOptions,
-    Sniff,
-    cloud_frames,
-    cloud_sequence,
-    inputs,
-    organised,
-)
+from tofuse.formats.sources import Reader, ReaderOptions, Sniff, cloud_files, inputs, organised
 
 _SUFFIXES = (".ply", ".csv", ".pcd")
 _AMPLITUDES = ("intensity", "amplitude", "i")
@@ -56,10 +48,10 @@ class Grid(Reader):
             return None
         return Sniff(1.0, f"{len(files)} clouds of {raster.width} x {raster.height} pixels")
 
-    def open(self, path: Path, options: ReaderOptions) -> cloud_sequence.CloudFileSource:
+    def open(self, path: Path, options: ReaderOptions) -> cloud_files.CloudFileSource:
         """See `Reader.open`."""
         inputs.refuse_camera(options, "grid")
-        files = cloud_sequence.required_files(path, *_SUFFIXES)
+        files = cloud_files.required_files(path, *_SUFFIXES)
         images: list[Float32] = []
         raster: organised.Raster | None = None
         for cells in organised.samples(len(files), lambda k: read_cells(files[k])):
@@ -77,7 +69,7 @@ class Grid(Reader):
         if camera is None:
             raise _not_organised(path)
         frames = _Frames(raster, camera, scale, offset)
-        source = cloud_sequence.CloudFileSource(path, files, frames.load)
+        source = cloud_files.CloudFileSource(path, files, frames.load)
         source.metadata |= {"depth_kind": "z"}
         if offset:
             source.warnings.append(
@@ -99,7 +91,7 @@ class Cells:
     @property
     def points(self) -> Float32:
         """(N, 3)."""
-        return cloud_frames.to_float32(self.cloud.points)
+        return cloud_files.to_float32(self.cloud.points)
 
     def raster(self) -> organised.Raster | None:
         """See `find_raster`."""
@@ -120,7 +112,7 @@ def read_cells(path: Path) -> Cells:
         width = int(stated) if stated.isdecimal() else None
     else:
         cloud = _read_csv(path)
-    points = cloud_frames.to_float32(cloud.points)
+    points = cloud_files.to_float32(cloud.points)
     plausible = (np.abs(points) < se3.MAX_COORDINATE_M).all(1, keepdims=True)
     points = np.where(plausible, points, np.float32(np.nan))
     return Cells(replace(cloud, points=points, normals=None), width)
@@ -139,7 +131,7 @@ def _read_csv(path: Path) -> GeometryRecord:
     column = next((columns[name] for name in _AMPLITUDES if name in columns), None)
     if not has_header and table.shape[1] == 4:
         column = 3
-    scalars = {} if column is None else {"amplitude": cloud_frames.to_float32(table[:, column])}
+    scalars = {} if column is None else {"amplitude": cloud_files.to_float32(table[:, column])}
     return GeometryRecord(table[:, indices], scalars=scalars)
 
 

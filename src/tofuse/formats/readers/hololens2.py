@@ -86,10 +86,8 @@ class HoloLens2Source(FileSource):
 
     def _read_poses(self, folder: Path, stream: str) -> None:
         """Read T_world_rig of each frame, and the pose of the camera in the rig."""
-        extrinsics, trajectory = (
-            folder / f"{stream}_extrinsics.txt",
-            folder / f"{stream}_rig2world.txt",
-        )
+        extrinsics = folder / f"{stream}_extrinsics.txt"
+        trajectory = folder / f"{stream}_rig2world.txt"
         if not reading.is_file(extrinsics) or not reading.is_file(trajectory):
             missing = trajectory if reading.is_file(extrinsics) else extrinsics
             self.warnings.append(f"{missing.name} is missing: there are no reference poses")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 import threading
 import weakref
@@ -21,14 +20,7 @@ from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
-from tofuse.formats.sources import (
-    FileSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    inputs,
-    pixels,
-)
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, pixels
 
 DISTANCE, AMPLITUDE, NOISE, CONFIDENCE, INFO = 100, 101, 105, 300, 420
 _IMAGES = {"flags": CONFIDENCE, "noise": NOISE, "amplitude": AMPLITUDE}
@@ -59,11 +51,7 @@ class IfmO3rSource(FileSource):
         self.data = reading.read_bytes(path, limit=_MAX_BYTES)
         self.frames = pcic_frames(self.data, path)
         super().__init__(_times(self.frames))
-        self.metadata |= {
-            "sensor": "ifm O3R (ToF)",
-            "depth_kind": "range",
-            "amplitude_kind": "raw",
-        }
+        self.metadata |= {"sensor": "ifm O3R (ToF)", "depth_kind": "range", "amplitude_kind": "raw"}
         for k, chunks in enumerate(self.frames):
             if not isinstance(chunks, InputError) and INFO in chunks:
                 try:
@@ -277,8 +265,7 @@ _REQUIRED = (
     "intrinsicCalibModelParameters",
 )
 _FIELDS = {"flags": "confidence", "noise": "distanceNoise", "amplitude": "amplitude"}
-_MAX_FRAMES, _MAX_ROW_BYTES = 1_000_000, 1 << 26  # per file, and per frame
-_LENS_PARAMETERS = 10
+_MAX_FRAMES, _MAX_ROW_BYTES = 1 << 20, 1 << 26  # per file, and per frame
 
 
 @part("reader", "ifm-h5", label="experimental")
@@ -365,7 +352,7 @@ class IfmH5Source(FileSource):
         counts = self._image(row, "distance")
         stored = np.asarray(row["intrinsicCalibModelParameters"], float).ravel()
         unit, model = float(row["distanceResolution"]), int(row["intrinsicCalibModelID"])
-        parameters = tuple(stored[:_LENS_PARAMETERS].tolist())
+        parameters = tuple(stored[:_PARAMETERS].tolist())
         info = checked_info(unit, model, parameters, self.where(index))
         images = {
             name: self._image(row, field, counts.shape)
@@ -388,7 +375,6 @@ BEGIN, END = b"star", b"stop"
 _HEAD = 36
 _TYPES = ("u1", "i1", "<u2", "<i2", "<u4", "<i4", "<f4", "<u8", "<f8")
 _MAX_SIDE = 8192
-_MAX_FRAMES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -402,7 +388,6 @@ class Chunk:
     time_us: int
     seconds: int
     nanoseconds: int
-    metadata: dict[str, Any]
     start: int
     end: int
 
@@ -447,11 +432,8 @@ def _chunks(data: bytes, offset: int, where: str) -> tuple[dict[int, Chunk], int
         if not _HEAD <= header_size <= size or offset + size > len(data):
             raise InputError(f"is cut off or damaged in chunk {kind}", where=where)
         seconds = nanoseconds = 0
-        metadata: dict[str, Any] = {}
         if version >= 2 and header_size >= 48:
             seconds, nanoseconds = struct.unpack_from("<2I", data, offset + 40)
-        if version >= 3 and header_size > 48:
-            metadata = _json(data[offset + 48 : offset + header_size])
         chunks[kind] = Chunk(
             kind,
             width,
@@ -460,20 +442,11 @@ def _chunks(data: bytes, offset: int, where: str) -> tuple[dict[int, Chunk], int
             time_us,
             seconds,
             nanoseconds,
-            metadata,
             offset + header_size,
             offset + size,
         )
         offset += size
     return chunks, offset + 4
-
-
-def _json(data: bytes) -> dict[str, Any]:
-    try:
-        metadata = json.loads(data.split(b"\0", 1)[0])
-    except (ValueError, RecursionError):
-        return {}
-    return metadata if isinstance(metadata, dict) else {}
 
 
 def chunk_image(data: bytes, chunk: Chunk, where: str) -> NDArray[Any]:

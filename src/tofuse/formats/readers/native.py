@@ -23,7 +23,7 @@ from tofuse.formats.sources import (
     Reader,
     ReaderOptions,
     Sniff,
-    cloud_frames,
+    cloud_files,
     gravity_at,
     inputs,
     pixels,
@@ -100,7 +100,7 @@ class NativeSource(FileSource):
         """See `FileSource.load`."""
         timestamp = float(self.timestamps[index])
         if self.camera is None:
-            return cloud_frames.ply_frame(self.files[index], index, timestamp)
+            return cloud_files.ply_frame(self.files[index], index, timestamp)
         camera = self._camera_of(index, self.camera)
         depth = self._depth(index)
         if self.correction is not None:
@@ -283,12 +283,7 @@ class NativeSource(FileSource):
                 f"{', '.join(description.unknown)}"
             )
         self.metadata |= description.stated(
-            "sensor",
-            "serial",
-            "frame_rate_hz",
-            "ambiguity_m",
-            "confidence_max",
-            "amplitude_kind",
+            "sensor", "serial", "frame_rate_hz", "ambiguity_m", "confidence_max", "amplitude_kind"
         )
         if self.camera is not None:
             self.metadata["depth_unit_m"] = description.depth_unit_m

@@ -18,13 +18,7 @@ from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import npz, reading
 from tofuse.formats.images import read_color, read_image
 from tofuse.formats.poses import OPENGL
-from tofuse.formats.sources import (
-    FileSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    inputs,
-)
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs
 
 NAMES = ("transforms.json", "transforms_train.json")
 _DEPTH = ("depth_file_path", "depth_path")

@@ -16,14 +16,7 @@ from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import npz, reading
-from tofuse.formats.sources import (
-    FileSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    inputs,
-    pixels,
-)
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, pixels
 
 MAX_BYTES = 1 << 30
 _IMAGES = {"amplitude": 3, "confidence": 3, "sigma": 3, "color": 4}
@@ -62,7 +55,7 @@ class NpzSource(FileSource):
 
     def __init__(self, path: Path, options: ReaderOptions) -> None:
         self.path = path
-        arrays = _load(path)
+        arrays = npz.read_npz(path, limit=MAX_BYTES)
         if "depth" not in arrays:
             raise self._error("depth", "is missing", "save depth as (N, H, W)")
         depth = arrays["depth"]
@@ -228,8 +221,3 @@ class NpzSource(FileSource):
 
     def _error(self, name: str, problem: str, remedy: str) -> InputError:
         return InputError(problem, where=f"{self.path}: {name}", remedy=remedy)
-
-
-def _load(path: Path) -> dict[str, NDArray[Any]]:
-    """Read all arrays; reject an implausible decompressed size."""
-    return npz.read_npz(path, limit=MAX_BYTES)

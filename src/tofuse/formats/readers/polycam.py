@@ -43,11 +43,7 @@ class PolycamSource(phones.PhoneSource):
     """Frames with ARKit's intrinsics, and the poses optimised by Polycam, or else ARKit's."""
 
     def __init__(self, folder: Path) -> None:
-        files = (
-            reading.files_with(folder / "depth", ".png")
-            if reading.is_folder(folder / "depth")
-            else []
-        )
+        files = inputs.files_at(folder / "depth", ".png")
         inputs.required(files, ".png files", folder / "depth", "export 'raw data' again")
         size = first_size(files)
         super().__init__(

@@ -34,7 +34,7 @@ class Record3D(Reader):
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         if reading.is_folder(path):
-            if reading.is_file(path / "metadata.json") and _numbered(path / "depth", _EXR):
+            if reading.is_file(path / "metadata.json") and _images(path / "depth"):
                 return Sniff(1.0, "metadata.json and depth/*.exr")
             if reading.is_file(path / "metadata") and reading.is_folder(path / "rgbd"):
                 return Sniff(1.0, "metadata and rgbd/, an unpacked .r3d archive")
@@ -117,7 +117,7 @@ class _Folder:
     def __init__(self, path: Path) -> None:
         self.where = path / "metadata.json"
         self.path = path
-        self.files = _numbered(path / "depth", _EXR)
+        self.files = _images(path / "depth")
         self.numbers = inputs.required(sorted(self.files), ".exr files", path / "depth", _REMEDY)
 
     def metadata(self) -> dict[str, Any]:
@@ -280,8 +280,8 @@ class _Metadata:
         return reading.number_in(self.data, field, self.where, default, _REMEDY)
 
 
-def _numbered(folder: Path, pattern: re.Pattern[str]) -> dict[int, Path]:
-    return {int(file.stem): file for file in reading.files_named(folder, pattern.fullmatch)}
+def _images(folder: Path) -> dict[int, Path]:
+    return {int(file.stem): file for file in reading.files_named(folder, _EXR.fullmatch)}
 
 
 def _checked(depth: Float32, size: tuple[int, int], where: str | Path) -> Float32:

@@ -16,7 +16,7 @@ from tofuse.engine.frames import Frame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
-from tofuse.formats.sources import Reader, ReaderOptions, Sniff, bags, cloud_frames, organised
+from tofuse.formats.sources import Reader, ReaderOptions, Sniff, bags, cloud_files, organised
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
@@ -88,7 +88,7 @@ class RosSource(bags.BagSource):
             )
 
     def where(self, index: int) -> str:
-        """See `BagSource.where`."""
+        """See `FileSource.where`."""
         return f"{self.path}: {self.connection.topic}, message {index}"
 
     def read_frame(self, index: int, where: str) -> Frame:
@@ -98,8 +98,8 @@ class RosSource(bags.BagSource):
         time, message = float(self.timestamps[index]), self.depth.message(index)
         cloud = bags.cloud(message, where)
         if self.raster is None:
-            return cloud_frames.cloud_frame(index, time, cloud)
-        points = cloud_frames.to_float32(cloud.points).reshape(message.height, message.width, 3)
+            return cloud_files.cloud_frame(index, time, cloud)
+        points = cloud_files.to_float32(cloud.points).reshape(message.height, message.width, 3)
         return organised.organised_frame(points, cloud, self.raster, index, time)
 
     def read_depth(self, index: int, where: str) -> Float32:
@@ -293,7 +293,7 @@ class RosSource(bags.BagSource):
         images = []
         for k, message in organised.samples(len(self.depth), lambda k: (k, self.depth.message(k))):
             with suppress(InputError):
-                points = cloud_frames.to_float32(bags.cloud(message, self.where(k)).points)
+                points = cloud_files.to_float32(bags.cloud(message, self.where(k)).points)
                 if min(message.width, message.height) < 2:
                     return None
                 images.append(points.reshape(message.height, message.width, 3))

@@ -86,9 +86,7 @@ def _matrix(file: Path) -> Float64:
 
 def _color_camera(path: Path, warnings: list[str]) -> camera_file.ColorCamera | None:
     """The camera of the colour images; None, with a warning, if it isn't that of these images."""
-    files = (
-        reading.files_with(path / "color", *_SUFFIXES) if reading.is_folder(path / "color") else []
-    )
+    files = inputs.files_at(path / "color", *_SUFFIXES)
     if not files:
         return None
     width, height = first_size(files)

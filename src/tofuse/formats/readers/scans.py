@@ -18,15 +18,7 @@ from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading
-from tofuse.formats.sources import (
-    FileSource,
-    Reader,
-    ReaderOptions,
-    Sniff,
-    cloud_frames,
-    cloud_sequence,
-    inputs,
-)
+from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, cloud_files, inputs
 
 MAX_POINTS = 100_000_000
 _E57 = b"ASTM-E57"
@@ -38,14 +30,14 @@ _COPY = "copy the file again, or export it again"
 
 
 @part("reader", "las")
-class LasScans(cloud_sequence.CloudReader):
+class LasScans(cloud_files.CloudReader):
     """A .las or .laz file, or a folder of them; metres (extra `scan`)."""
 
     suffixes = (".las", ".laz")
 
-    def source(self, path: Path, files: list[Path]) -> cloud_sequence.CloudFileSource:
+    def source(self, path: Path, files: list[Path]) -> cloud_files.CloudFileSource:
         """See `CloudReader.source`."""
-        return cloud_sequence.CloudFileSource(path, files, _las_frame)
+        return cloud_files.CloudFileSource(path, files, _las_frame)
 
 
 def _las_header(path: Path) -> Any:
@@ -169,7 +161,7 @@ def _las_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     color = color if color is not None and color.any() else None
     scalars = {"intensity": intensity} if intensity.any() else {}
     cloud = GeometryRecord(xyz, color=color, scalars=scalars)
-    return cloud_frames.cloud_frame(index, timestamp, cloud)
+    return cloud_files.cloud_frame(index, timestamp, cloud)
 
 
 @part("reader", "e57")
@@ -233,7 +225,7 @@ class E57Source(FileSource):
             color = color.astype(np.uint8)
         scalars = {"intensity": data["intensity"]} if "intensity" in data else {}
         cloud = GeometryRecord(points, color=color, scalars=scalars)
-        return cloud_frames.cloud_frame(index, float(index), cloud)
+        return cloud_files.cloud_frame(index, float(index), cloud)
 
     def _pose(self, header: Any) -> Float64:
         if not header.has_pose():

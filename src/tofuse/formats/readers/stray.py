@@ -13,14 +13,7 @@ from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading, tables
 from tofuse.formats.images import Video, first_size
-from tofuse.formats.sources import (
-    Reader,
-    ReaderOptions,
-    Sniff,
-    gravity_at,
-    inputs,
-    phones,
-)
+from tofuse.formats.sources import Reader, ReaderOptions, Sniff, gravity_at, inputs, phones
 
 FRAME_RATE_HZ = 60.0
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -67,7 +60,7 @@ class StraySource(phones.PhoneSource):
         files = reading.files_with(folder / "depth", ".png")
         files = files or reading.files_with(folder / "depth", ".npy")
         inputs.required(files, ".png or .npy files", folder / "depth")
-        confidence = {p.stem: p for p in _images(folder / "confidence")}
+        confidence = {p.stem: p for p in inputs.files_at(folder / "confidence", ".png")}
         super().__init__(
             files,
             np.arange(len(files)) / FRAME_RATE_HZ,
@@ -179,7 +172,3 @@ class StraySource(phones.PhoneSource):
                     )
                 except InputError as error:
                     self.cameras[k] = error
-
-
-def _images(folder: Path) -> list[Path]:
-    return reading.files_with(folder, ".png") if reading.is_folder(folder) else []

@@ -49,11 +49,7 @@ class Zense(Reader):
         if not 0.01 <= rate <= 1e4:
             rate = FRAME_RATE_HZ
         source = DepthImageSource(
-            files,
-            np.arange(len(files)) / rate,
-            camera,
-            sensor="Pico Zense (ToF)",
-            options=options,
+            files, np.arange(len(files)) / rate, camera, sensor="Pico Zense (ToF)", options=options
         )
         source.metadata["frame_rate_hz"] = rate
         source.warnings.append(f"no timestamps: a frame rate of {rate:g} Hz is assumed")

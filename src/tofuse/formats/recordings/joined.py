@@ -9,11 +9,7 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames import (
-    Frame,
-    RangeFrame,
-    Source,
-)
+from tofuse.engine.frames import Frame, RangeFrame, Source
 
 
 class JoinedSource:

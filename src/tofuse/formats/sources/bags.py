@@ -214,10 +214,6 @@ class BagSource(FileSource):
         with reading.library_errors(where, REMEDY):
             return self.read_frame(index, where)
 
-    def where(self, index: int) -> str:
-        """Return the name of a frame for errors."""
-        return f"{self.path}: frame {index}"
-
     def read_frame(self, index: int, where: str) -> Frame:
         """Read a frame, which `where` names in errors."""
         time = float(self.timestamps[index])

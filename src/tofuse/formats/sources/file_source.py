@@ -12,13 +12,7 @@ from typing import Any
 from tofuse.engine.arrays import Float32, Float64, UInt8, UInt16
 from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.engine.frames import (
-    AmplitudeKind,
-    DepthKind,
-    Frame,
-    RangeFrame,
-    depth_counts,
-)
+from tofuse.engine.frames import AmplitudeKind, DepthKind, Frame, RangeFrame, depth_counts
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import check_first_size, read_color, read_image

@@ -21,7 +21,6 @@ from tofuse.formats.sources.pixels import resized
 # ARKit's camera looks along -z with y up.
 ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 SENSOR = "iPhone or iPad LiDAR (direct ToF)"
-# Key of the metadata: the program that estimated the recorded poses.
 IMAGE_SIZE = (1920, 1440)  # of ARKit's colour images, to which its intrinsics refer
 CONFIDENCE_MAX = 2.0
 

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp, UInt8
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import (
-    RangeFrame,
-)
+from tofuse.engine.frames import RangeFrame
 from tofuse.formats.cameras import camera_file
 
 

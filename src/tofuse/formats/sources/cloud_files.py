@@ -1,4 +1,4 @@
-"""A source over files with one cloud each."""
+"""Clouds of files as frames without invalid points, and sources over files with one cloud each."""
 
 from __future__ import annotations
 
@@ -6,20 +6,50 @@ import re
 from abc import abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float64
+from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame
+from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import name_of
 from tofuse.formats.files import reading, tables
+from tofuse.formats.geometry import read_ply
 from tofuse.formats.sources import inputs
 from tofuse.formats.sources.file_source import FileSource
 from tofuse.formats.sources.organised import Deprojection, find_deprojection, samples
 from tofuse.formats.sources.reader import Reader, ReaderOptions, Sniff
+
+
+def ply_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
+    """Read a PLY cloud; non-finite points are dropped."""
+    return cloud_frame(index, timestamp, read_ply(path))
+
+
+def to_float32(values: NDArray[Any]) -> Float32:
+    """Return numbers of a file as float32: infinite beyond its range, NaN for signalling NaN."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return values.astype(np.float32, copy=False)
+
+
+def cloud_frame(
+    index: int, timestamp: float, cloud: GeometryRecord, *, origin: Float64 | None = None
+) -> CloudFrame:
+    """Return a cloud of a file as a view, without invalid points; see `CloudFrame.of`."""
+    return CloudFrame.of(
+        cloud.points,
+        index=index,
+        timestamp=timestamp,
+        origin=origin,
+        normals=cloud.normals,
+        amplitude=cloud.amplitude,
+        color=cloud.color,
+    )
+
 
 LoadFrame = Callable[[Path, int, float], Frame]
 
@@ -40,12 +70,7 @@ class CloudFileSource(FileSource):
     """
 
     def __init__(
-        self,
-        path: Path,
-        files: list[Path],
-        load_frame: LoadFrame,
-        *,
-        deproject: bool = False,
+        self, path: Path, files: list[Path], load_frame: LoadFrame, *, deproject: bool = False
     ) -> None:
         super().__init__(np.arange(len(files), dtype=float))
         self.files = files
