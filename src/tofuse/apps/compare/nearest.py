@@ -31,6 +31,8 @@ _SHARP_RAD = 0.44
 # A mesh with faces of this fraction of its area each, which cover most of it, has faces as a CAD
 # model has; there are not more.
 _MIN_FACE, _MIN_COVERED, _MAX_FACES = 0.002, 0.9, 300
+# A surface is closed if its volume, by any two axes, agrees to this fraction.
+_MAX_GAP = 0.02
 # Vertices with which a mesh is not coarse.
 _COARSE = 5000
 # Edge of a region of other surfaces, as a fraction of the diagonal.
@@ -177,9 +179,24 @@ class Reference:
         """Of the box around the surface, m."""
         return float(np.linalg.norm(np.ptp(self.triangles.reshape(-1, 3), axis=0)))
 
-    def turned(self) -> Reference:
-        """Return the surface with its sides exchanged."""
-        return replace(self, normals=-self.normals)
+    @cached_property
+    def is_solid(self) -> bool:
+        """Whether it encloses a volume, up to cracks between faces; by the divergence theorem."""
+        if self.surface.faces is None:
+            return False
+        vectors = self.area[:, None] * self.normals
+        moments = (self.centres - self.centres.mean(0)).T @ vectors
+        volume = np.trace(moments) / 3
+        gap = np.abs(moments - volume * np.eye(3)).max() <= _MAX_GAP * abs(volume)
+        return bool(gap and np.linalg.norm(vectors.sum(0)) <= _MAX_GAP * self.area.sum())
+
+    def nearest(self, points: Float64) -> Float64:
+        """Return the nearest points (n, 3) of the surface, whichever way it faces."""
+        parts = [
+            self._nearest(part, np.zeros_like(part), False)[0]
+            for part in (points[a : a + _CHUNK] for a in range(0, max(len(points), 1), _CHUNK))
+        ]
+        return np.concatenate(parts)
 
     def distances(
         self, points: Float64, normals: Float64, reach: Reach, *, oriented: bool = True
