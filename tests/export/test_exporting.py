@@ -256,6 +256,11 @@ def test_export_command(result: Path, tmp_path: Path, capsys) -> None:
     assert "--overwrite" in capsys.readouterr().err
     assert main(["export", str(result), "las", "--out", str(out), "--overwrite"]) == 0
     assert (out / "cloud.las").read_bytes() == before
+    (result / "mesh.ply").unlink()
+    fresh = tmp_path / "fresh"
+    assert main(["export", str(result), "stl", "--out", str(fresh)]) == 2
+    assert "mesh.ply: doesn't exist" in capsys.readouterr().err
+    assert not fresh.exists()
     assert main(["export", str(tmp_path), "las"]) == 2
     assert "is not a result" in capsys.readouterr().err
     assert main(["export", str(result), "doc"]) == 2

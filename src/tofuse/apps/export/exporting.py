@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -77,9 +77,10 @@ class _Result:
         mesh = read_mesh(path)
         if mesh is None:
             raise InputError(
-                "doesn't exist: clouds without a camera model have no surface",
+                "doesn't exist",
                 where=path,
-                remedy="choose a format for clouds",
+                remedy="choose a format for clouds, which have no surface without a camera model, "
+                "or run again if it was deleted",
             )
         if not len(mesh.faces):
             raise InputError("has no triangles", where=path, remedy="choose a format for clouds")
@@ -249,8 +250,12 @@ def export(
         )
     target = folder if out is None else Path(out)
     files = {name: target / FORMATS[name][0] for name in dict.fromkeys(formats)}
-    atomic.make_folder(target)
-    with folders.claimed(target), _unchanged(folder), run_json.opened(folder) as run:
+    with (
+        _made(target),
+        folders.claimed(target),
+        _unchanged(folder),
+        run_json.opened(folder) as run,
+    ):
         own = run.get("sha256", {}) if target.resolve() == folder.resolve() else {}
         for path in files.values():
             if path.name in own:
@@ -268,6 +273,20 @@ def export(
         for name in sorted(files, key=lambda name: FORMATS[name][1] is not _images):
             FORMATS[name][1](result, files[name])
     return list(files.values())
+
+
+@contextmanager
+def _made(folder: Path) -> Iterator[None]:
+    """Make a folder, and remove it again if the block fails and leaves it empty."""
+    existed = folder.exists()
+    atomic.make_folder(folder)
+    try:
+        yield
+    except BaseException:
+        if not existed:
+            with suppress(OSError):
+                folder.rmdir()
+        raise
 
 
 @contextmanager
