@@ -203,7 +203,7 @@ def test_large_meshes_have_vertex_colours(result: Path, upright, monkeypatch) ->
 
 @pytest.mark.parametrize("name", ["glb", "stl"])
 def test_a_surface_without_triangles_is_refused(name: str, result: Path) -> None:
-    with pytest.raises(InputError, match="--faces: is too few"):
+    with pytest.raises(InputError, match="faces: 1 are too few"):
         export(result, [name], faces=1)
     mesh = read_ply(result / "mesh.ply")
     write_ply(result / "mesh.ply", replace(mesh, faces=np.zeros((0, 3), np.int32)))

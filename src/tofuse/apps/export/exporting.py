@@ -108,19 +108,11 @@ class _Result:
         max_faces = self.faces or DISPLAY_FACES
         n_faces = min(max_faces, len(self.mesh.faces))
         if self.mesh.color is None or n_faces > _MAX_TEXTURED_FACES:
-            return _not_empty(self.mesh.decimated(max_faces)).record()
+            return self.mesh.decimated(max_faces).record()
         baked = texture.baked(self.mesh, max_faces, TEXTURE_SIZE)
-        _not_empty(baked.mesh)
         rows, faces = baked.atlas.vertices, baked.atlas.faces
         other_bytes = _VERTEX_BYTES * len(rows) + _FACE_BYTES * len(faces) + _OTHER_BYTES
         return textured_record(baked, _jpeg(baked.image, other_bytes))
-
-
-def _not_empty(mesh: Mesh) -> Mesh:
-    """Return a simplified mesh, if any triangle is left."""
-    if not len(mesh.faces):
-        raise InputError("is too few triangles: none is left", where="--faces", remedy="pass more")
-    return mesh
 
 
 def _jpeg(image: UInt8, other_bytes: int) -> bytes:
@@ -144,7 +136,7 @@ def _mesh(result: _Result, path: Path) -> None:
 def _stl(result: _Result, path: Path) -> None:
     mesh = result.mesh
     if result.faces is not None:
-        mesh = _not_empty(mesh.decimated(result.faces))
+        mesh = mesh.decimated(result.faces)
     exchange.save(mesh.record(), path, result.R_up_world)
 
 
