@@ -370,7 +370,7 @@ def _certain(views: _CloudViews, local: _Pose) -> Registration | None:
 
 
 def _unit_ratio(source: Frame, target: Frame) -> float:
-    """Return the ratio of two units nearest to that of the target's extent to the source's; or 1."""
+    """Return the ratio of units nearest to that of the target's extent to the source's; or 1."""
     source_extent, target_extent = extent(source.points), extent(target.points)
     if source_extent == 0 or target_extent == 0:
         return 1.0
