@@ -107,7 +107,11 @@ def test_surface_that_a_solid_lacks_does_not_pass(part) -> None:
         normals=np.concatenate([calm.normals, np.tile([0.0, 0, 1], (len(table), 1))]),
         sigma=np.full(len(calm.points) + len(table), NOISE),
     )
-    assert compared(on_table, part, 0.002, searched=False).verdict == "pass"
+    found = compared(on_table, part, 0.002, searched=False)
+    assert found.verdict == "pass"
+    share = len(table) / len(on_table.points)
+    assert found.to_dict()["without_counterpart"] == pytest.approx(share, abs=0.02)
+    assert "% has no counterpart in it." in found.sentence
 
 
 def test_a_solid_is_recognised(part) -> None:

@@ -184,7 +184,10 @@ class Comparison:
             found = f"{head[str(self.verdict)]}; the largest deviation is {largest}"
         if self.given:
             found += f" ({self.given})"
-        found += f". {words.percent(1 - self.seen)} of the reference was not seen."
+        found += (
+            f". {words.percent(1 - self.seen)} of the reference was not seen, and of what was "
+            f"measured {words.percent(self.deviations.beyond)} has no counterpart in it."
+        )
         if not self.deviations.unmatched:
             return found
         first = self.deviations.unmatched[0]
@@ -225,6 +228,7 @@ class Comparison:
                 "left_out_at_edges_m": self.deviations.left_out,
                 "places": len(places.deviation),
                 "changed": self.changed,
+                "without_counterpart": self.deviations.beyond,
                 "unmatched": [vars(each) for each in self.deviations.unmatched],
                 "regions": [vars(region) for region in self.regions],
                 "worst": self.worst,

@@ -148,6 +148,8 @@ class DeviationMap:
         Number of motions that the surface does not determine.
     noise_scale
         Scatter of neighbouring points, as a multiple of the stated noise.
+    beyond
+        Fraction of the measured points that the reference has no surface near.
     unmatched
         Surface of a part that a solid reference lacks.
     """
@@ -163,6 +165,7 @@ class DeviationMap:
     left_out: float
     free: int
     noise_scale: float
+    beyond: float
     unmatched: tuple[Unmatched, ...] = ()
 
 
@@ -266,6 +269,7 @@ def mapped(
         left_out = _EDGE_SPACINGS * spacing
         deviation[KdTree(reference.edges).nearest(found.feet, left_out)[0] >= 0] = np.nan
     compared = np.flatnonzero(np.isfinite(deviation))
+    beyond = 1 - float(found.compared.mean())
     seen = _seen(reference, found, spacing)
     stated = None if measured.sigma is None else measured.sigma[chosen]
     if stated is not None and reference.sigma is not None:
@@ -283,7 +287,7 @@ def mapped(
     if not count:
         return DeviationMap(
             T, points, normals, deviation, np.full(len(points), np.nan), place,
-            _no_places(size), seen, left_out, free, 1.0,
+            _no_places(size), seen, left_out, free, 1.0, beyond,
         )  # fmt: skip
     sums = _Sums(label, count)
     mean = sums.mean(d)
@@ -315,7 +319,7 @@ def mapped(
     )
     return DeviationMap(
         T, points, normals, deviation, of_points, place, places, seen, left_out, free, scale,
-        lacking,
+        beyond, lacking,
     )  # fmt: skip
 
 
