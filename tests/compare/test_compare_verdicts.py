@@ -123,6 +123,14 @@ def test_a_solid_is_recognised(part) -> None:
     assert not Reference.of(scan(part)).is_solid
 
 
+def test_a_solid_that_is_inside_out_is_turned(part) -> None:
+    inverted = Reference.of(replace(part.surface, faces=part.surface.faces[:, ::-1]))
+    found = compared(scan(part, bump=0.006), inverted, 0.002, searched=False)
+    assert found.verdict == "fail"
+    worst = max(found.worst, key=lambda row: abs(row["deviation_m"]))
+    assert worst["deviation_m"] > 0.004
+
+
 def test_a_pose_is_found_without_a_guess(part) -> None:
     found = compared(moved(scan(part)), part, 0.002)
     assert found.verdict == "pass"

@@ -120,7 +120,7 @@ class Reference:
 
     @classmethod
     def of(cls, surface: Surface) -> Reference:
-        """Divide a surface."""
+        """Divide a surface; a solid whose faces are all inside out is turned."""
         if surface.faces is None:
             size = spacing_of(surface.points)
             points = np.repeat(surface.points[:, None], 3, axis=1)
@@ -155,9 +155,11 @@ class Reference:
         if sigma is not None:
             sigma = sigma[surface.faces].mean(1)[kept][source]
         parts = triangle_geometry.areas(triangles)
-        return cls(
+        made = cls(
             surface, triangles, normals, parts, region, edges, size, has_faces, sigma
         )._sorted()
+        inside_out = made.is_solid and np.trace(made._moments) < 0
+        return replace(made, normals=-made.normals) if inside_out else made
 
     def _sorted(self) -> Reference:
         """Number the regions by their area."""
@@ -184,11 +186,15 @@ class Reference:
         """Whether it encloses a volume, up to cracks between faces; by the divergence theorem."""
         if self.surface.faces is None:
             return False
-        vectors = self.area[:, None] * self.normals
-        moments = (self.centres - self.centres.mean(0)).T @ vectors
-        volume = np.trace(moments) / 3
-        gap = np.abs(moments - volume * np.eye(3)).max() <= _MAX_GAP * abs(volume)
-        return bool(gap and np.linalg.norm(vectors.sum(0)) <= _MAX_GAP * self.area.sum())
+        total = (self.area[:, None] * self.normals).sum(0)
+        volume = np.trace(self._moments) / 3
+        gap = np.abs(self._moments - volume * np.eye(3)).max() <= _MAX_GAP * abs(volume)
+        return bool(gap and np.linalg.norm(total) <= _MAX_GAP * self.area.sum())
+
+    @cached_property
+    def _moments(self) -> Float64:
+        """(3, 3) integral of position times normal: the volume of a solid on the diagonal."""
+        return (self.centres - self.centres.mean(0)).T @ (self.area[:, None] * self.normals)
 
     def nearest(self, points: Float64) -> Float64:
         """Return the nearest points (n, 3) of the surface, whichever way it faces."""
