@@ -257,10 +257,14 @@ def test_export_command(result: Path, tmp_path: Path, capsys) -> None:
     assert main(["export", str(result), "las", "--out", str(out), "--overwrite"]) == 0
     assert (out / "cloud.las").read_bytes() == before
     (result / "mesh.ply").unlink()
-    fresh = tmp_path / "fresh"
-    assert main(["export", str(result), "stl", "--out", str(fresh)]) == 2
-    assert "mesh.ply: doesn't exist" in capsys.readouterr().err
-    assert not fresh.exists()
+    (out / "mine.txt").write_text("mine")
+    kept = sorted(out.iterdir())
+    for folder in (tmp_path / "fresh", out):  # the cloud comes first
+        words = ["export", str(result), "pcd", "log", "stl", "--out", str(folder)]
+        assert main(words) == 2
+        assert "mesh.ply: doesn't exist" in capsys.readouterr().err
+    assert not (tmp_path / "fresh").exists()
+    assert sorted(out.iterdir()) == kept
     assert main(["export", str(tmp_path), "las"]) == 2
     assert "is not a result" in capsys.readouterr().err
     assert main(["export", str(result), "doc"]) == 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -243,7 +244,7 @@ def export(
     target = folder if out is None else Path(out)
     files = {name: target / FORMATS[name][0] for name in dict.fromkeys(formats)}
     with (
-        _made(target),
+        _all_or_nothing(target, list(files.values())),
         folders.claimed(target),
         _unchanged(folder),
         run_json.opened(folder) as run,
@@ -268,13 +269,18 @@ def export(
 
 
 @contextmanager
-def _made(folder: Path) -> Iterator[None]:
-    """Make a folder, and remove it again if the block fails and leaves it empty."""
+def _all_or_nothing(folder: Path, files: Sequence[Path]) -> Iterator[None]:
+    """Make a folder; if the block fails, remove what it added of these files, and what it made."""
     existed = folder.exists()
     atomic.make_folder(folder)
+    before = set(folder.iterdir())
+    stems = {path.name.partition(".")[0] for path in files}
     try:
         yield
     except BaseException:
+        for path in set(folder.iterdir()) - before:
+            if path.name.partition(".")[0] in stems:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
         if not existed:
             with suppress(OSError):
                 folder.rmdir()
