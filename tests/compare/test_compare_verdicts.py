@@ -120,7 +120,14 @@ def test_a_solid_is_recognised(part) -> None:
     assert not Reference.of(replace(box, faces=box.faces[2:])).is_solid
     tube = replace(box, faces=box.faces[4:])  # its normals cancel
     assert not Reference.of(tube).is_solid
-    assert not Reference.of(scan(part)).is_solid
+    # A thin shell with a crack along one of its triangles, which a large one is not.
+    shell = drawn(meshes.box([0.2, 0.14, 0.06]), meshes.inside_out(meshes.box([0.19, 0.13, 0.05])))
+    corner, *others = shell.points[shell.faces[0]]
+    for width, is_solid in ((0.05, True), (0.2, False)):
+        triangle = np.array([corner, *(end + width * (corner - end) for end in others)])
+        points = np.concatenate([shell.points, triangle])
+        faces = np.vstack([[16, 17, 18], shell.faces[1:]]).astype(np.int32)
+        assert Reference.of(replace(shell, points=points, faces=faces)).is_solid == is_solid
 
 
 def test_a_solid_that_is_inside_out_is_turned(part) -> None:

@@ -31,8 +31,10 @@ _SHARP_RAD = 0.44
 # A mesh with faces of this fraction of its area each, which cover most of it, has faces as a CAD
 # model has; there are not more.
 _MIN_FACE, _MIN_COVERED, _MAX_FACES = 0.002, 0.9, 300
-# A surface is closed if its volume, by any two axes, agrees to this fraction.
-_MAX_GAP = 0.02
+# A surface is closed if its normals cancel up to this fraction of its area, and its volume is the
+# same along all axes up to the second one, as along the axis of an open tube it is none. Thin walls
+# have little volume beside what a crack changes.
+_MAX_GAP, _MAX_VOLUME_GAP = 0.02, 0.25
 # Vertices with which a mesh is not coarse.
 _COARSE = 5000
 # Edge of a region of other surfaces, as a fraction of the diagonal.
@@ -188,8 +190,9 @@ class Reference:
             return False
         total = (self.area[:, None] * self.normals).sum(0)
         volume = np.trace(self._moments) / 3
-        gap = np.abs(self._moments - volume * np.eye(3)).max() <= _MAX_GAP * abs(volume)
-        return bool(gap and np.linalg.norm(total) <= _MAX_GAP * self.area.sum())
+        gap = np.abs(self._moments - volume * np.eye(3)).max()
+        is_open = np.linalg.norm(total) > _MAX_GAP * self.area.sum()
+        return bool(not is_open and gap <= _MAX_VOLUME_GAP * abs(volume))
 
     @cached_property
     def _moments(self) -> Float64:
