@@ -412,12 +412,12 @@ def test_ambiguous_corridor_is_rejected():
     assert len(found.unobservable) >= 1
 
 
-@pytest.mark.parametrize("scale", [0.001, 1000.0])
+@pytest.mark.parametrize("scale", [0.001, 1000.0, 1 / 25.4])
 def test_different_units_are_reported(scans, scale):
     source, target, _ = scans
     found = tofuse.register(source * scale, target)
     assert found.believed is False
-    assert f"{1 / scale:g} times as large" in found.reason
+    assert f"{1 / scale:.4g} times as large" in found.reason
     assert "unit" in found.reason
 
 

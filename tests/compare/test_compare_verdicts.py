@@ -74,6 +74,70 @@ def test_a_bump_decides_the_verdict(part, bump, verdict) -> None:
         assert worst["verdict"] == "fail"
 
 
+def test_surface_that_a_solid_lacks_does_not_pass(part) -> None:
+    """A block that is not drawn is beyond the reach of deviations; a table is no part of it."""
+    post = meshes.box([0.03, 0.03, 0.04], [-0.06, 0.04, 0.045])
+    blocks = (
+        meshes.box([0.2, 0.14, 0.05]),
+        meshes.box([0.05, 0.08, 0.06], [0.04, 0.02, 0.055]),
+        meshes.box([0.03, 0.03, 0.05], [-0.07, -0.04, 0.05]),
+    )
+    extended = scan(Reference.of(drawn(*blocks, post)))
+    found = compared(extended, part, 0.002, searched=False)
+    assert found.verdict == "undecided"
+    assert found.sentence.startswith("Undecided: not all of the surface has a counterpart")
+    (more,) = found.deviations.unmatched
+    np.testing.assert_allclose(more.centre_m, [-0.06, 0.04, 0.05], atol=0.01)
+    assert 0.02 < more.distance_m < 0.045
+    assert found.to_dict()["unmatched"][0]["area_m2"] == more.area_m2
+    assert compared(extended, part, searched=False).deviations.unmatched
+    # Fail stays fail, and what an open surface lacks was only not scanned there.
+    bumped = scan(Reference.of(drawn(*blocks, post)), bump=0.006)
+    assert compared(bumped, part, 0.002, searched=False).verdict == "fail"
+    open_surface = replace(part.surface, faces=part.surface.faces[2:])
+    found = compared(extended, Reference.of(open_surface), 0.002, searched=False)
+    assert not found.deviations.unmatched
+    x, y = np.random.default_rng(5).uniform(-0.2, 0.2, (2, 15_000))
+    beside = (np.abs(x) > 0.1) | (np.abs(y) > 0.07)
+    table = np.column_stack([x, y, np.full(len(x), -0.025)])[beside]
+    calm = scan(part)
+    on_table = replace(
+        calm,
+        points=np.concatenate([calm.points, table]),
+        normals=np.concatenate([calm.normals, np.tile([0.0, 0, 1], (len(table), 1))]),
+        sigma=np.full(len(calm.points) + len(table), NOISE),
+    )
+    found = compared(on_table, part, 0.002, searched=False)
+    assert found.verdict == "pass"
+    share = len(table) / len(on_table.points)
+    assert found.to_dict()["without_counterpart"] == pytest.approx(share, abs=0.02)
+    assert "% has no counterpart in it." in found.sentence
+
+
+def test_a_solid_is_recognised(part) -> None:
+    assert part.is_solid
+    box = drawn(meshes.box([0.2, 0.14, 0.05]))
+    assert not Reference.of(replace(box, faces=box.faces[2:])).is_solid
+    tube = replace(box, faces=box.faces[4:])  # its normals cancel
+    assert not Reference.of(tube).is_solid
+    # A thin shell with a crack along one of its triangles, which a large one is not.
+    shell = drawn(meshes.box([0.2, 0.14, 0.06]), meshes.inside_out(meshes.box([0.19, 0.13, 0.05])))
+    corner, *others = shell.points[shell.faces[0]]
+    for width, is_solid in ((0.05, True), (0.2, False)):
+        triangle = np.array([corner, *(end + width * (corner - end) for end in others)])
+        points = np.concatenate([shell.points, triangle])
+        faces = np.vstack([[16, 17, 18], shell.faces[1:]]).astype(np.int32)
+        assert Reference.of(replace(shell, points=points, faces=faces)).is_solid == is_solid
+
+
+def test_a_solid_that_is_inside_out_is_turned(part) -> None:
+    inverted = Reference.of(replace(part.surface, faces=part.surface.faces[:, ::-1]))
+    found = compared(scan(part, bump=0.006), inverted, 0.002, searched=False)
+    assert found.verdict == "fail"
+    worst = max(found.worst, key=lambda row: abs(row["deviation_m"]))
+    assert worst["deviation_m"] > 0.004
+
+
 def test_a_pose_is_found_without_a_guess(part) -> None:
     found = compared(moved(scan(part)), part, 0.002)
     assert found.verdict == "pass"

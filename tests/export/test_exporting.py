@@ -203,7 +203,7 @@ def test_large_meshes_have_vertex_colours(result: Path, upright, monkeypatch) ->
 
 @pytest.mark.parametrize("name", ["glb", "stl"])
 def test_a_surface_without_triangles_is_refused(name: str, result: Path) -> None:
-    with pytest.raises(InputError, match="--faces: is too few"):
+    with pytest.raises(InputError, match="faces: 1 are too few"):
         export(result, [name], faces=1)
     mesh = read_ply(result / "mesh.ply")
     write_ply(result / "mesh.ply", replace(mesh, faces=np.zeros((0, 3), np.int32)))
@@ -256,6 +256,15 @@ def test_export_command(result: Path, tmp_path: Path, capsys) -> None:
     assert "--overwrite" in capsys.readouterr().err
     assert main(["export", str(result), "las", "--out", str(out), "--overwrite"]) == 0
     assert (out / "cloud.las").read_bytes() == before
+    (result / "mesh.ply").unlink()
+    (out / "mine.txt").write_text("mine")
+    kept = sorted(out.iterdir())
+    for folder in (tmp_path / "fresh", out):  # the cloud comes first
+        words = ["export", str(result), "pcd", "log", "stl", "--out", str(folder)]
+        assert main(words) == 2
+        assert "mesh.ply: doesn't exist" in capsys.readouterr().err
+    assert not (tmp_path / "fresh").exists()
+    assert sorted(out.iterdir()) == kept
     assert main(["export", str(tmp_path), "las"]) == 2
     assert "is not a result" in capsys.readouterr().err
     assert main(["export", str(result), "doc"]) == 2

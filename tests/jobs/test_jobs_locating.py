@@ -159,6 +159,17 @@ def test_one_frame_of_a_recording(session_results, clip, capsys) -> None:
     assert done.endswith("1 of 1 frames located\n")
 
 
+def test_one_selected_frame(session_results, clip, tmp_path, capfd) -> None:
+    """Also of a folder with a # in its name, which is no frame's number."""
+    shutil.copytree(clip, tmp_path / "clip#2")
+    words = session_results["here"], tmp_path / "clip#2", "--start", 3, "--end", 4
+    status, data = locate_json(capfd, *words)
+    assert status == 0
+    assert [frame["index"] for frame in data["frames"]] == [3]
+    named = session_results["here"], f"{clip}#3", "--every", 2
+    refuses(capfd, "locate", *named, says=("clip#3: names one frame already", "--every"))
+
+
 def test_clip_of_another_room_has_status_3(session_results, tmp_path, capfd) -> None:
     foreign = again(tmp_path / "foreign", AGAIN[::2], **FOREIGN[1])
     out = tmp_path / "out"

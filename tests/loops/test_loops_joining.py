@@ -261,6 +261,13 @@ def test_short_gap_does_not_support_distant_pose(three) -> None:
     assert not checks.is_near(a, b, right @ se3.exp([0, 0, -4.0, 0, 1.5, 0]), MAX_OVERLAP_DISTANCE)
 
 
+def test_equal_timestamps_say_nothing_of_the_gap(three) -> None:
+    merged = MergedComponents([replace(each, times=0 * each.times) for each in three[:2]])
+    checks = JoinChecks(merged)
+    T = se3.inverse(PATH[0]) @ PATH[12]
+    assert not checks.is_near(*merged.all, T, MAX_OVERLAP_DISTANCE)
+
+
 def test_motion_between_recordings_is_unconstrained() -> None:
     path, parts, link = turned_back(0.0)
     (group,) = BY_LINKS.join([parts[0], replace(parts[1], recording=1)], [link])

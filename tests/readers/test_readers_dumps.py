@@ -67,6 +67,11 @@ def test_nerfstudio_with_views_for_training_alone(tmp_path: Path) -> None:
     )
     for path in (tmp_path / "scan", file):
         check_frames(open_recording(path))
+    test = file.with_name("transforms_test.json")
+    test.write_bytes(file.read_bytes())
+    (note,) = (w for w in open_recording(tmp_path / "scan").warnings if "the only frames" in w)
+    assert "transforms_test.json" in note
+    assert len(open_recording(file, test)) == 2 * len(open_recording(test))
 
 
 def test_nerfstudio(tmp_path: Path) -> None:

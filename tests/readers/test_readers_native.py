@@ -396,6 +396,22 @@ def test_camera_of_different_image_size(tmp_path: Path) -> None:
     assert not isinstance(caught.value, UnreadableFrameError)
 
 
+def test_a_first_image_of_another_size_is_one_frame_without_it(tmp_path: Path) -> None:
+    """A thumbnail, or a frame of another mode of the camera, says nothing of the others."""
+    folder = write(tmp_path / "a", 3)
+    (folder / "color").mkdir(exist_ok=True)
+    for k, size in enumerate([(60, 80, 3), (30, 40, 3), (30, 40, 3)]):
+        write_png(folder / "color" / f"{k:06}.png", np.full(size, 100, np.uint8))
+    recording = open_recording(folder)
+    assert recording[0].color is None
+    assert recording[1].color is not None
+    assert any("colour can't be read in 1 frame" in line for line in recording.warnings)
+    for k in (1, 2):
+        write_png(folder / "color" / f"{k:06}.png", np.full((60, 80, 3), 100, np.uint8))
+    with pytest.raises(InputError, match=r"000000.png: is 80 x 60 pixels, camera.json states"):
+        open_recording(folder)
+
+
 def test_writer_refuses_invalid_frames(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "a", PINHOLE)
     with pytest.raises(InputError, match="no frames"):

@@ -25,6 +25,7 @@ from tofuse.apps.results.folders import OutputFolder
 from tofuse.apps.results.output import write_result
 from tofuse.apps.viewer.report_server import FrameImages, ReportServer, report_pages
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.formats.export.conversion import convert
@@ -62,6 +63,13 @@ def made(tmp_path_factory):
     (folder / "out" / "component-1").mkdir()
     (folder / "out" / "component-1" / "report.html").write_text("<html>another</html>")
     return frames, folder / "out"
+
+
+def test_result_without_report_is_refused(made, tmp_path) -> None:
+    shutil.copytree(made[1], tmp_path / "out")
+    (tmp_path / "out" / "report.html").unlink()
+    with pytest.raises(InputError, match=r"has no report\.html; run again without --no-report"):
+        report_pages(tmp_path / "out")
 
 
 @pytest.fixture(scope="module")

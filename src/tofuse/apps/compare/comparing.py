@@ -155,7 +155,7 @@ class Comparison:
 
     @property
     def sentence(self) -> str:
-        """What was found, in one or two sentences."""
+        """What was found, in a few sentences."""
         places = self.deviations.places
         worst = int(np.abs(places.deviation).argmax())
         at = ", ".join(f"{1e3 * v:.0f}" for v in places.centres[worst])
@@ -173,16 +173,31 @@ class Comparison:
         else:
             limit = f"{1e3 * self.tolerance_m:g} mm"
             counts = places.verdicts(self.tolerance_m)
+            close = f"Undecided: {_places(counts == 0)} too close to {limit} for "
             head = {
                 "pass": f"Pass: every place seen is within {limit}",
                 "fail": f"Fail: {_places(counts < 0)} outside {limit}",
-                "undecided": f"Undecided: {_places(counts == 0)} too close to {limit} for "
-                f"{'its' if (counts == 0).sum() == 1 else 'their'} uncertainty",
-            }
+                "undecided": close + ("its" if (counts == 0).sum() == 1 else "their")
+                + " uncertainty" if (counts == 0).any()
+                else "Undecided: not all of the surface has a counterpart",
+            }  # fmt: skip
             found = f"{head[str(self.verdict)]}; the largest deviation is {largest}"
         if self.given:
             found += f" ({self.given})"
-        return f"{found}. {words.percent(1 - self.seen)} of the reference was not seen."
+        found += (
+            f". {words.percent(1 - self.seen)} of the reference was not seen, and of what was "
+            f"measured {words.percent(self.deviations.beyond)} has no counterpart in it."
+        )
+        if not self.deviations.unmatched:
+            return found
+        first = self.deviations.unmatched[0]
+        at = ", ".join(f"{1e3 * v:.0f}" for v in first.centre_m)
+        area = 1e4 * sum(each.area_m2 for each in self.deviations.unmatched)
+        return (
+            f"{found} The reference lacks {area:.0f} cm\N{SUPERSCRIPT TWO} of what was measured, "
+            f"most of it round ({at}) mm, up to {words.length(first.distance_m)} away: "
+            "a feature is missing, additional or elsewhere, or something touches the part."
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of `compare.json`: SI units, null where unknown."""
@@ -213,6 +228,8 @@ class Comparison:
                 "left_out_at_edges_m": self.deviations.left_out,
                 "places": len(places.deviation),
                 "changed": self.changed,
+                "without_counterpart": self.deviations.beyond,
+                "unmatched": [vars(each) for each in self.deviations.unmatched],
                 "regions": [vars(region) for region in self.regions],
                 "worst": self.worst,
                 "warnings": self.warnings,
@@ -326,6 +343,8 @@ def compared(
         reason = reason or "the poses of the result are not bounded in some direction"
     regions = tuple(_regions(deviations, reference, tolerance_m, decided=not reason))
     verdict = None if tolerance_m is None else _of_all(regions, reason)
+    if verdict == "pass" and deviations.unmatched:
+        verdict = "undecided"
     return Comparison(
         verdict, tolerance_m, regions, deviations, registration, given, reason, shared_m,
         tuple(warnings), measured, reference,

@@ -16,6 +16,7 @@ from scipy.stats import norm
 
 from tofuse.apps.compare.nearest import Distances, Reach, Reference
 from tofuse.apps.compare.surface import Surface, spacing_of, unit_vectors
+from tofuse.apps.compare.unmatched import FEWEST, Unmatched, unmatched
 from tofuse.apps.report import scene
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.geometry import KdTree, se3
@@ -29,8 +30,8 @@ _CUT_TOLERANCES, _CUT_SIGMAS = 3.0, 4.0
 _MIN_INFORMATION = 1e-3
 # Spacings of the points round a sharp edge, where a fused surface is round, that are left out.
 _EDGE_SPACINGS = 2.0
-# Points of a place: limits, and the noise of its mean as a fraction of the tolerance.
-_FEWEST, _MOST, _MEAN_NOISE = 12, 400, 0.1
+# Most points of a place, and the noise of its mean as a fraction of the tolerance.
+_MOST, _MEAN_NOISE = 400, 0.1
 # Without a tolerance a place is this fraction of the diagonal; never larger than the second.
 _PLACE_FRACTION, _MAX_PLACE_FRACTION = 0.025, 0.05
 _MAX_PLACES = 1000
@@ -147,6 +148,10 @@ class DeviationMap:
         Number of motions that the surface does not determine.
     noise_scale
         Scatter of neighbouring points, as a multiple of the stated noise.
+    beyond
+        Fraction of the measured points that the reference has no surface near.
+    unmatched
+        Surface of a part that a solid reference lacks.
     """
 
     T_reference_measured: Float64
@@ -160,6 +165,8 @@ class DeviationMap:
     left_out: float
     free: int
     noise_scale: float
+    beyond: float
+    unmatched: tuple[Unmatched, ...] = ()
 
 
 def fitted(
@@ -190,7 +197,7 @@ def _iterated(
         moved = se3.transform(T, points)
         found = reference.distances(moved, normals @ T[:3, :3].T, reach, oriented=measured.oriented)
         used = found.compared
-        if used.sum() < _FEWEST:
+        if used.sum() < FEWEST:
             return T, 6
         r = found.signed[used]
         scale = SIGMA_OF_MEDIAN * np.median(np.abs(r - np.median(r)))
@@ -262,6 +269,7 @@ def mapped(
         left_out = _EDGE_SPACINGS * spacing
         deviation[KdTree(reference.edges).nearest(found.feet, left_out)[0] >= 0] = np.nan
     compared = np.flatnonzero(np.isfinite(deviation))
+    beyond = 1 - float(found.compared.mean())
     seen = _seen(reference, found, spacing)
     stated = None if measured.sigma is None else measured.sigma[chosen]
     if stated is not None and reference.sigma is not None:
@@ -279,7 +287,7 @@ def mapped(
     if not count:
         return DeviationMap(
             T, points, normals, deviation, np.full(len(points), np.nan), place,
-            _no_places(size), seen, left_out, free, 1.0,
+            _no_places(size), seen, left_out, free, 1.0, beyond,
         )  # fmt: skip
     sums = _Sums(label, count)
     mean = sums.mean(d)
@@ -304,9 +312,15 @@ def mapped(
     row = np.maximum(label, 0)
     of_points[compared] = np.where(label < 0, np.nan, np.hypot(sigma, places.sigma[row]))
     deviation[compared[label < 0]] = np.nan
-    return DeviationMap(
-        T, points, normals, deviation, of_points, place, places, seen, left_out, free, scale
+    # Rounding moves a surface at an edge by less than half of the width that it is left out for.
+    limit = (tolerance_m or 0.0) + 0.5 * _EDGE_SPACINGS * spacing + _CUT_SIGMAS * shared_m
+    lacking = unmatched(
+        reference, points, normals, found.compared, measured.oriented, size, spacing, limit
     )
+    return DeviationMap(
+        T, points, normals, deviation, of_points, place, places, seen, left_out, free, scale,
+        beyond, lacking,
+    )  # fmt: skip
 
 
 def _gradients(
@@ -408,10 +422,10 @@ def _place_size(
         size = _PLACE_FRACTION * reference.diagonal
     else:
         needed = (COVERAGE * noise / (_MEAN_NOISE * tolerance_m)) ** 2
-        size = spacing * float(np.sqrt(np.clip(needed, _FEWEST, _MOST)))
+        size = spacing * float(np.sqrt(np.clip(needed, FEWEST, _MOST)))
     size = min(size, _MAX_PLACE_FRACTION * reference.diagonal)
     fewest = float(np.sqrt(reference.area.sum() / _MAX_PLACES))
-    return max(size, spacing * _FEWEST**0.5, fewest)
+    return max(size, spacing * FEWEST**0.5, fewest)
 
 
 def _grouped(feet: Float64, region: Intp, size: float) -> tuple[Intp, int]:
@@ -431,7 +445,7 @@ def _grouped(feet: Float64, region: Intp, size: float) -> tuple[Intp, int]:
     key = np.column_stack([region, cell])
     _, label, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
     label = label.ravel()
-    large = count >= max(_FEWEST, 0.4 * float(np.median(count[count >= min(_FEWEST, count.max())])))
+    large = count >= max(FEWEST, 0.4 * float(np.median(count[count >= min(FEWEST, count.max())])))
     if not large.any():
         return np.full(len(feet), -1, np.intp), 0
     sums = _Sums(label, len(count))

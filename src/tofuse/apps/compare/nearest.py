@@ -31,6 +31,10 @@ _SHARP_RAD = 0.44
 # A mesh with faces of this fraction of its area each, which cover most of it, has faces as a CAD
 # model has; there are not more.
 _MIN_FACE, _MIN_COVERED, _MAX_FACES = 0.002, 0.9, 300
+# A surface is closed if its normals cancel up to this fraction of its area, and its volume is the
+# same along all axes up to the second one, as along the axis of an open tube it is none. Thin walls
+# have little volume beside what a crack changes.
+_MAX_GAP, _MAX_VOLUME_GAP = 0.02, 0.25
 # Vertices with which a mesh is not coarse.
 _COARSE = 5000
 # Edge of a region of other surfaces, as a fraction of the diagonal.
@@ -118,7 +122,7 @@ class Reference:
 
     @classmethod
     def of(cls, surface: Surface) -> Reference:
-        """Divide a surface."""
+        """Divide a surface; a solid whose faces are all inside out is turned."""
         if surface.faces is None:
             size = spacing_of(surface.points)
             points = np.repeat(surface.points[:, None], 3, axis=1)
@@ -153,9 +157,11 @@ class Reference:
         if sigma is not None:
             sigma = sigma[surface.faces].mean(1)[kept][source]
         parts = triangle_geometry.areas(triangles)
-        return cls(
+        made = cls(
             surface, triangles, normals, parts, region, edges, size, has_faces, sigma
         )._sorted()
+        inside_out = made.is_solid and np.trace(made._moments) < 0
+        return replace(made, normals=-made.normals) if inside_out else made
 
     def _sorted(self) -> Reference:
         """Number the regions by their area."""
@@ -177,9 +183,29 @@ class Reference:
         """Of the box around the surface, m."""
         return float(np.linalg.norm(np.ptp(self.triangles.reshape(-1, 3), axis=0)))
 
-    def turned(self) -> Reference:
-        """Return the surface with its sides exchanged."""
-        return replace(self, normals=-self.normals)
+    @cached_property
+    def is_solid(self) -> bool:
+        """Whether it encloses a volume, up to cracks between faces; by the divergence theorem."""
+        if self.surface.faces is None:
+            return False
+        total = (self.area[:, None] * self.normals).sum(0)
+        volume = np.trace(self._moments) / 3
+        gap = np.abs(self._moments - volume * np.eye(3)).max()
+        is_open = np.linalg.norm(total) > _MAX_GAP * self.area.sum()
+        return bool(not is_open and gap <= _MAX_VOLUME_GAP * abs(volume))
+
+    @cached_property
+    def _moments(self) -> Float64:
+        """(3, 3) integral of position times normal: the volume of a solid on the diagonal."""
+        return (self.centres - self.centres.mean(0)).T @ (self.area[:, None] * self.normals)
+
+    def nearest(self, points: Float64) -> Float64:
+        """Return the nearest points (n, 3) of the surface, whichever way it faces."""
+        parts = [
+            self._nearest(part, np.zeros_like(part), False)[0]
+            for part in (points[a : a + _CHUNK] for a in range(0, max(len(points), 1), _CHUNK))
+        ]
+        return np.concatenate(parts)
 
     def distances(
         self, points: Float64, normals: Float64, reach: Reach, *, oriented: bool = True

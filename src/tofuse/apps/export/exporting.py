@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -77,9 +78,10 @@ class _Result:
         mesh = read_mesh(path)
         if mesh is None:
             raise InputError(
-                "doesn't exist: clouds without a camera model have no surface",
+                "doesn't exist",
                 where=path,
-                remedy="choose a format for clouds",
+                remedy="choose a format for clouds, which have no surface without a camera model, "
+                "or run again if it was deleted",
             )
         if not len(mesh.faces):
             raise InputError("has no triangles", where=path, remedy="choose a format for clouds")
@@ -107,19 +109,11 @@ class _Result:
         max_faces = self.faces or DISPLAY_FACES
         n_faces = min(max_faces, len(self.mesh.faces))
         if self.mesh.color is None or n_faces > _MAX_TEXTURED_FACES:
-            return _not_empty(self.mesh.decimated(max_faces)).record()
+            return self.mesh.decimated(max_faces).record()
         baked = texture.baked(self.mesh, max_faces, TEXTURE_SIZE)
-        _not_empty(baked.mesh)
         rows, faces = baked.atlas.vertices, baked.atlas.faces
         other_bytes = _VERTEX_BYTES * len(rows) + _FACE_BYTES * len(faces) + _OTHER_BYTES
         return textured_record(baked, _jpeg(baked.image, other_bytes))
-
-
-def _not_empty(mesh: Mesh) -> Mesh:
-    """Return a simplified mesh, if any triangle is left."""
-    if not len(mesh.faces):
-        raise InputError("is too few triangles: none is left", where="--faces", remedy="pass more")
-    return mesh
 
 
 def _jpeg(image: UInt8, other_bytes: int) -> bytes:
@@ -143,7 +137,7 @@ def _mesh(result: _Result, path: Path) -> None:
 def _stl(result: _Result, path: Path) -> None:
     mesh = result.mesh
     if result.faces is not None:
-        mesh = _not_empty(mesh.decimated(result.faces))
+        mesh = mesh.decimated(result.faces)
     exchange.save(mesh.record(), path, result.R_up_world)
 
 
@@ -249,8 +243,12 @@ def export(
         )
     target = folder if out is None else Path(out)
     files = {name: target / FORMATS[name][0] for name in dict.fromkeys(formats)}
-    atomic.make_folder(target)
-    with folders.claimed(target), _unchanged(folder), run_json.opened(folder) as run:
+    with (
+        _all_or_nothing(target, list(files.values())),
+        folders.claimed(target),
+        _unchanged(folder),
+        run_json.opened(folder) as run,
+    ):
         own = run.get("sha256", {}) if target.resolve() == folder.resolve() else {}
         for path in files.values():
             if path.name in own:
@@ -268,6 +266,25 @@ def export(
         for name in sorted(files, key=lambda name: FORMATS[name][1] is not _images):
             FORMATS[name][1](result, files[name])
     return list(files.values())
+
+
+@contextmanager
+def _all_or_nothing(folder: Path, files: Sequence[Path]) -> Iterator[None]:
+    """Make a folder; if the block fails, remove what it added of these files, and what it made."""
+    existed = folder.exists()
+    atomic.make_folder(folder)
+    before = set(folder.iterdir())
+    stems = {path.name.partition(".")[0] for path in files}
+    try:
+        yield
+    except BaseException:
+        for path in set(folder.iterdir()) - before:
+            if path.name.partition(".")[0] in stems:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        if not existed:
+            with suppress(OSError):
+                folder.rmdir()
+        raise
 
 
 @contextmanager

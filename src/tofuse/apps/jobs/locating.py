@@ -32,7 +32,7 @@ from tofuse.engine.search import pose_probability
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.tracking import Keyframes, given
 from tofuse.formats.poses import write_tum
-from tofuse.formats.recordings import Opening, OpeningOptions, open_view
+from tofuse.formats.recordings import Opening, OpeningOptions, open_view, split_name
 
 # Frames of a clip that are located.
 _LOCATED = 4
@@ -274,23 +274,26 @@ def _located_in(
     result: Path, name: str, options: LocateOptions, progress: Progress
 ) -> list[LocatedFrame]:
     folders.check_result(result)
-    recording = None if "#" in name else Opening.of([name], options).open()
-    if recording is not None and len(recording) == 1:
-        recording = None  # its frame is located like one that is named
+    recording, (path, number) = None, split_name(name)
     frame: Frame | None
-    if recording is None:
+    if number is None:
+        recording = Opening.of([path], options).open()
+        frame = recording.first_readable()
+    elif (options.start, options.end, options.every) != (0, None, 1):
+        raise InputError(
+            "names one frame already", where=name, remedy="leave out --start, --end and --every"
+        )
+    else:
         view = open_view(name, format=options.format, camera=options.camera, topic=options.topic)
         frame = view.frame
-    else:
-        frame = recording.first_readable()
     if frame is not None and kind_of(frame) == "cloud":
         return [_located_cloud(result, name, options, progress)]
     progress.stage("reading the map")
     index = ResultMap.read(result, options.threads, progress)
     progress.stage("locating")
-    if recording is None:
-        assert frame is not None
+    if frame is not None and (recording is None or len(recording) == 1):
         return [index.locate_frame(frame)]
+    assert recording is not None
     return index.locate_clip(recording, progress)
 
 

@@ -88,6 +88,8 @@ def report_pages(folder: Path) -> dict[str, tuple[str, bytes]]:
     folders.check_result(folder)
     with run_json.opened(folder):
         pass
+    if not (folder / "report.html").exists():
+        raise InputError("has no report.html", where=folder, remedy="run again without --no-report")
     pages = {"": (_HTML, reading.read_bytes(folder / "report.html"))}
     for path in sorted(folder.glob("component-*/report.html")):
         if folders.component_number(path.parent) is not None:

@@ -70,6 +70,11 @@ _symmetries: WeakKeyDictionary[Frame, Float64] = WeakKeyDictionary()
 _MAX_SCORE_LOSS = 0.02
 # Points used to test whether a rival converges to the best pose.
 _RIVAL_POINTS = 2500
+# Ratios of units: powers of ten, and inches, feet in mm, and inches in m; and by which power of ten
+# the extents may differ from one.
+_UNIT_RATIOS = np.array([1.0, 10.0, 25.4, 1e2, 304.8, 1e3, 1 / 0.0254])
+_UNIT_RATIOS = np.concatenate([_UNIT_RATIOS, 1 / _UNIT_RATIOS[1:]])
+_MAX_UNIT_LOG = 0.5
 # Points of each view that decide whether its unit is wrong.
 _UNIT_POINTS = 30_000
 # Finest resolution, in spacings of this number of points.
@@ -236,26 +241,25 @@ def register_clouds(
 
     Returns
     -------
-    The registration. If the views fit only with the source scaled by a power of ten from 0.001 to
-    1000, the pose is roughly that of the scaled source, not accepted; `reason` states the scale.
+    The registration. If the views fit only with the source scaled from one unit to another, the
+    pose is roughly that of the scaled source, not accepted; `reason` states the scale.
 
     Raises
     ------
     RegistrationError
         If there are too few points, or no pose has enough correspondences.
     """
-    power = _scale_exponent(source, target)
-    if power and not always_search:
-        scale = 10.0**power
+    scale = _unit_ratio(source, target)
+    if scale != 1 and not always_search:
         registration = _registered_scaled(source, target, scale, rng)
         if registration is not None:
-            reason = f"the views fit with the source {scale:g} times as large: check its unit"
+            reason = f"the views fit with the source {scale:.4g} times as large: check its unit"
             return replace(registration, believed=False, reason=reason)
     try:
         views = _CloudViews.of(source, target, rng)
         return _registered(views, guess, image_registration, always_search=always_search)
     except RegistrationError as error:
-        if not power:
+        if scale == 1:
             raise
         ratio = float(f"{extent(source.points) / extent(target.points):.2g}")
         raise RegistrationError(
@@ -359,13 +363,13 @@ def _certain(views: _CloudViews, local: _Pose) -> Registration | None:
     return None if len(registration.unobservable) else registration
 
 
-def _scale_exponent(source: Frame, target: Frame) -> int:
-    """Return log10 of the ratio of the target's extent to the source's, rounded; 0 beyond +-3."""
+def _unit_ratio(source: Frame, target: Frame) -> float:
+    """Return the ratio of units nearest to that of the target's extent to the source's; or 1."""
     source_extent, target_extent = extent(source.points), extent(target.points)
     if source_extent == 0 or target_extent == 0:
-        return 0
-    exponent = round(float(np.log10(target_extent / source_extent)))
-    return exponent if abs(exponent) <= 3 else 0
+        return 1.0
+    off = np.abs(np.log10(_UNIT_RATIOS * source_extent / target_extent))
+    return float(_UNIT_RATIOS[off.argmin()]) if off.min() <= _MAX_UNIT_LOG else 1.0
 
 
 def _registered_scaled(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Intp, UInt8
 from tofuse.engine.compute import ProcessLock
+from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.cloud import Cloud, has_color
 from tofuse.engine.fusion.clustering_kernels import (
     flatten_groups,
@@ -222,6 +223,11 @@ class Mesh(Exportable):
         A vertex has the mean normal, colour and variance of the vertices merged into it, and their
         maximum number of views. Very large meshes are first reduced by `clustered`, which takes
         less memory; as are those of too many pieces for collapsing edges to suffice.
+
+        Raises
+        ------
+        InputError
+            If so few triangles leave nothing of it.
         """
         if len(self.faces) <= faces:
             return self
@@ -236,7 +242,14 @@ class Mesh(Exportable):
             reduced = mesh._merge_groups(group, np.bincount(group), remaining, positions)
         else:
             reduced = mesh.clustered(faces)
-        return reduced._without_degenerate()
+        reduced = reduced._without_degenerate()
+        if not len(reduced.faces):
+            raise InputError(
+                f"{faces} are too few for the surface: none is left",
+                where="faces",
+                remedy="pass more",
+            )
+        return reduced
 
     def _without_degenerate(self) -> Mesh:
         """Return the mesh of the triangles that have an area and are finite."""
@@ -249,10 +262,11 @@ class Mesh(Exportable):
 
         Vertex clustering (Rossignac and Borrel 1993), separately for both sides of thin structures,
         with the vertex that is closest to the planes of the adjacent triangles (Lindstrom 2000), so
-        that edges and corners stay sharp.
+        that edges and corners stay sharp. The mesh is empty if cells of its size leave more.
         """
         if len(self.faces) <= faces:
             return self
+        largest = 2 * float(np.ptp(self.vertices, axis=0).max())
         # Two triangles a cell, if it is flat.
         cell = float(np.sqrt(self._double_area * len(self.faces) / faces))
         while True:
@@ -261,6 +275,8 @@ class Mesh(Exportable):
             if len(remaining) <= faces:
                 positions = self._optimal_positions(group, count, cell)
                 return self._merge_groups(group, count, remaining, positions)
+            if cell > largest:
+                return self.rows(np.zeros(len(self.faces), bool))
             # A larger step than a flat surface would need.
             cell *= float(np.clip((len(remaining) / faces) ** 0.6, 1.02, 2.0))
 

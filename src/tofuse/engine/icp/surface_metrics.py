@@ -128,7 +128,8 @@ def surface_pairs(matches: Matches, alignment: Alignment, *, source: bool = Fals
     if np.count_nonzero(valid) < MIN_PAIRS:
         raise RegistrationError(
             f"only {np.count_nonzero(valid)} points of the views correspond and have normals, "
-            f"{MIN_PAIRS} are needed"
+            f"{MIN_PAIRS} are needed",
+            remedy="pass views of a common surface; few points, or points on a line, have none",
         )
     centre = p[valid].mean(0)
     pairs = SurfacePairs(

@@ -180,7 +180,7 @@ class JoinChecks:
         T = {**a.T, **transformed(b.T, T_a_b)}
         for before, after in self._merged.of_same_recording(a, b):
             elapsed = float(after.times[0] - before.times[-1])
-            if elapsed < 0:
+            if elapsed <= 0:  # clocks that stand still tell no speed either
                 continue
             reach = self.speed * elapsed
             if reach[0] < max_motion * before.depth and reach[1] < max_motion:

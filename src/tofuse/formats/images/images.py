@@ -145,22 +145,25 @@ def _check_complete(data: bytes) -> None:
 
 
 def check_first_size(files: Sequence[Path], size: tuple[int, int], where: str, remedy: str) -> None:
-    """Compare the size of the first readable image with (width, height), stated by `where`.
+    """Compare the size of the first images with (width, height), stated by `where`.
 
     Raises
     ------
     InputError
-        If they differ. Errors of a file are raised when it is read.
+        If that of all of them differs. Errors of a single file are raised when it is read.
     """
+    problems: list[InputError] = []
     for path in files[:5]:
         try:
             header = read_header(path)
         except InputError:
             continue
-        if (header.width, header.height) != size:
-            problem = f"is {header.width} x {header.height} pixels, {where} {size[0]} x {size[1]}"
-            raise InputError(problem, where=path, remedy=remedy)
-        return
+        if (header.width, header.height) == size:
+            return
+        problem = f"is {header.width} x {header.height} pixels, {where} {size[0]} x {size[1]}"
+        problems.append(InputError(problem, where=path, remedy=remedy))
+    if problems:
+        raise problems[0]
 
 
 def first_size(files: Sequence[Path]) -> tuple[int, int]:

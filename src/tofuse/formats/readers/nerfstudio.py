@@ -20,7 +20,8 @@ from tofuse.formats.images import read_color, read_image
 from tofuse.formats.poses import OPENGL
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs
 
-NAMES = ("transforms.json", "transforms_train.json")
+# The first one that a folder has is read; the others are parts of the same scene.
+NAMES = ("transforms.json", *(f"transforms_{part}.json" for part in ("train", "val", "test")))
 _DEPTH = ("depth_file_path", "depth_path")
 _IMAGES = ("", ".png", ".jpg", ".jpeg")  # NeRFCapture omits suffixes
 _MODELS = {
@@ -49,7 +50,16 @@ class Nerfstudio(Reader):
     def open(self, path: Path, options: ReaderOptions) -> NerfstudioSource:
         """See `Reader.open`."""
         inputs.refuse_camera(options, "nerfstudio", inputs.PER_FRAME)
-        return NerfstudioSource(_file(path))
+        file = _file(path)
+        source = NerfstudioSource(file)
+        others = [name for name in NAMES[1:] if name != file.name and path.is_dir()]
+        unread = [name for name in others if reading.is_file(path / name)]
+        if file.name in NAMES[1:] and unread:
+            source.warnings.append(
+                f"{file}: the only frames read; join those of {' and '.join(unread)} by naming "
+                "each file as an input"
+            )
+        return source
 
 
 class NerfstudioSource(FileSource):

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         open_recording,
         open_view,
         read_reference,
+        split_name,
     )
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)
