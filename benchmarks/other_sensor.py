@@ -111,9 +111,9 @@ SENSORS = {
 def _office(assembly: Assembly, rng: np.random.Generator) -> None:
     walls = [unusual.WALL, unusual.PLASTER, unusual.WALL, unusual.PLASTER]
     shell(assembly, (-2.4, -2.0, 0), (2.4, 2.0, 2.6), walls, unusual.GROUND, unusual.WHITE)
-    desk(assembly, placed((1.6, 0.9), rng.uniform(-0.3, 0.3)))
+    desk(assembly.at(placed((1.6, 0.9), rng.uniform(-0.3, 0.3))))
     for k, at in enumerate([(1.2, -1.0), (-1.2, 1.1), (-1.5, -0.9)]):
-        chair(assembly, unusual.THINGS[k], placed(at, rng.uniform(0, 6)))
+        chair(assembly.at(placed(at, rng.uniform(0, 6))), unusual.THINGS[k])
     _boxes(assembly, rng, 18, (-2.2, -1.8), (2.2, 1.8), clear=0.8)
 
 

@@ -199,12 +199,12 @@ def _chairs(assembly: Assembly, rng: np.random.Generator) -> None:
     shell(assembly, (-3, -2.5, 0), (3, 2.5, 2.5), [WALL] * 4, GROUND, WHITE)
     for k in range(4):
         at = tuple(rng.uniform((-1.5, -1.2), (1.5, 1.2)))
-        chair(assembly, THINGS[k], placed(at, rng.uniform(0, 6)))
+        chair(assembly.at(placed(at, rng.uniform(0, 6))), THINGS[k])
 
 
 def _chair_alone(assembly: Assembly, _rng: np.random.Generator) -> None:
     """Add a chair, nothing else."""
-    chair(assembly, THINGS[2], placed((0.0, 0.0), 0.3))
+    chair(assembly.at(placed((0.0, 0.0), 0.3)), THINGS[2])
 
 
 def _stairwell(assembly: Assembly, _rng: np.random.Generator) -> None:
@@ -258,7 +258,7 @@ def _plants(assembly: Assembly, rng: np.random.Generator) -> None:
     for k in range(10):
         a = 2 * np.pi * k / 10
         at = (2.0 * np.cos(a) + rng.uniform(-0.2, 0.2), 1.8 * np.sin(a) + rng.uniform(-0.2, 0.2))
-        plant(assembly, placed(at, rng.uniform(0, 6)), rng)
+        plant(assembly.at(placed(at, rng.uniform(0, 6))), rng)
 
 
 def _tunnel(assembly: Assembly, _rng: np.random.Generator) -> None:

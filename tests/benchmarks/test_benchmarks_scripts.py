@@ -51,6 +51,14 @@ def names_in(script: Path) -> Iterator[str]:
             yield from (alias.asname or alias.name for alias in node.names)
 
 
+def test_own_scenes_can_be_built() -> None:
+    unusual, other_sensor = (importlib.import_module(n) for n in ("unusual", "other_sensor"))
+    made = [unusual.built(name, fill) for name, (fill, _) in other_sensor.SCENES.items()]
+    own = [u.scene for u in unusual.UNUSUAL.values() if "built" in u.scene.__qualname__]
+    for scene in (*made, *own):
+        assert scene(0).materials
+
+
 @pytest.mark.parametrize("script", ["tracking", "scaling", "end_to_end", "offline_system"])
 def test_script_prints_help(script: str, capsys) -> None:
     with pytest.raises(SystemExit, match="0"):

@@ -9,11 +9,13 @@ import pytest
 
 import tofuse
 from measured_parts import NOISE, drawn, scan
+from tofuse.apps.compare import comparing
 from tofuse.apps.compare import deviations as module
 from tofuse.apps.compare.comparing import _regions, compared
 from tofuse.apps.compare.deviations import COVERAGE
 from tofuse.apps.compare.nearest import Reach, Reference
 from tofuse.apps.compare.surface import Surface, in_metres
+from tofuse.apps.pairs import register
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.fusion.mesh import Mesh
@@ -144,6 +146,26 @@ def test_a_pose_is_found_without_a_guess(part) -> None:
     gap = found.deviations.T_reference_measured @ T
     assert np.linalg.norm(gap[:3, 3]) < 2e-4
     assert se3.angle(gap) < 1e-3
+
+
+def test_a_guess_excludes_rivals_that_are_far_from_it(part, monkeypatch) -> None:
+    right = se3.inverse(T)
+    turned = se3.exp(np.array([0, 0, 0, 0, 0, np.pi])) @ right
+
+    def doubtful(source, target, guess=None, method=None):
+        found = register(source, target, guess=guess, method=method)
+        return found if method else replace(found, believed=False, runner_up=turned, reason="close")
+
+    monkeypatch.setattr(comparing, "register", doubtful)
+    measured = moved(scan(part))
+    near = right @ se3.exp(np.array([0.01, -0.01, 0, 0, 0.05, 0]))
+    found = compared(measured, part, 0.002, near)
+    assert found.verdict == "pass"
+    assert found.given == "given the guess: another pose fits nearly as well"
+    # Without one, or between both, it is not decided.
+    between = se3.exp(np.array([0, 0, 0, 0, 0, 0.4 * np.pi])) @ right
+    for guess in (None, between):
+        assert "not accepted: close" in compared(measured, part, 0.002, guess).sentence
 
 
 @pytest.mark.nightly_part

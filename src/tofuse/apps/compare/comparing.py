@@ -19,6 +19,7 @@ from tofuse.apps.report import scene, words
 from tofuse.apps.results import run_json
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Bool, Float64, Intp
+from tofuse.engine.clouds import AnyPair
 from tofuse.engine.errors import InputError, RegistrationError
 from tofuse.engine.frames import CloudFrame
 from tofuse.engine.fusion import GeometryRecord
@@ -32,6 +33,7 @@ WORST = 5  # places that are listed of each region
 _MAX_POINTS = 100_000  # that are registered
 # A reference is symmetric if this fraction of it, moved, lies within this fraction of its diagonal.
 _SYMMETRIC_SHARE, _SYMMETRIC_DISTANCE, _SYMMETRIC_POINTS = 0.9, 2e-3, 4000
+_NEARER = 0.5  # distance from the guess to a pose, relative to that to a rival which it excludes
 _MAX_RIVAL = 0.9  # fraction of the points of a pose that a rival may explain, to be excluded
 _MAX_FITTED = 0.3  # by which a fit changes a symmetry, as a fraction of it
 _SLIDE = 0.02  # along a direction that is not determined, as a fraction of the diagonal
@@ -383,13 +385,19 @@ def _registered(
         ):
             found = near
     T, rival = found.T_target_source, found.runner_up
+    if guess is not None and rival is not None and not found.believed:
+        # Whoever states where the part lies excludes poses elsewhere.
+        moved = [_distance(points, pose, guess) for pose in (T, rival)]
+        alone = register(points, target, guess=T, method=AnyPair(search=False))
+        if alone.believed and moved[0] < _NEARER * moved[1]:
+            found, T = alone, alone.T_target_source
     names = []
     if rival is not None and (found.given_guess or not found.believed):
         motion = rival @ se3.inverse(T)
         if _is_symmetry(reference, motion):
             names.append(f"{_motion_words(motion)} it fits as well")
         elif found.given_guess and guess is not None:
-            names.append("another pose fits as well")
+            names.append("another pose fits nearly as well")
         elif found.given_guess:
             found = replace(found, believed=False, reason="another pose fits as well")
     slides = _slides(reference, T, found.unobservable)
@@ -404,6 +412,12 @@ def _registered(
     if found.believed or given:
         return found, given, ""
     return found, "", f"the registration is not accepted: {found.reason or 'it is not verified'}"
+
+
+def _distance(points: Float64, T: Float64, T_other: Float64) -> float:
+    """Return the mean distance of points (N, 3) moved by two poses."""
+    apart = se3.transform(T, points) - se3.transform(T_other, points)
+    return float(np.linalg.norm(apart, axis=1).mean())
 
 
 def _explained(measured: Surface, reference: Reference, T: Float64) -> float:
