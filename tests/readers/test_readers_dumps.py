@@ -60,6 +60,13 @@ def test_polycam_without_optimised_poses(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.reference[:, :3, 3], POSES[:, :3, 3] + 0.01)
 
 
+def test_poses_of_a_phone_are_told_from_those_of_a_program(tmp_path: Path) -> None:
+    made.make_nerfcapture(tmp_path / "phone")
+    made.make_nerfstudio(tmp_path / "program")
+    assert open_recording(tmp_path / "phone").metadata["poses_by"] == "NeRFCapture"
+    assert "poses_by" not in open_recording(tmp_path / "program").metadata
+
+
 def test_nerfstudio_with_views_for_training_alone(tmp_path: Path) -> None:
     made.make_nerfstudio(tmp_path / "scan")
     file = (tmp_path / "scan" / "transforms.json").rename(

@@ -12,7 +12,7 @@ import numpy as np
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths, scaled
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import RangeFrame, depth_counts
+from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import npz, reading
@@ -91,6 +91,8 @@ class NerfstudioSource(FileSource):
             document, "sigma_unit_scale_factor", file, 1e-4, _REMEDY
         )
         self.metadata |= {"depth_kind": "z", "depth_unit_m": self.unit_m}
+        if all("depth_path" in frame.entry for frame in self.frames):  # a phone's, as ARKit has them
+            self.metadata[POSES_BY] = "NeRFCapture"
         if without_depth:
             self.warnings.append(f"{file}: {without_depth} frames have no depth: skipped")
         if not timed:
