@@ -175,14 +175,16 @@ class Comparison:
         else:
             limit = f"{1e3 * self.tolerance_m:g} mm"
             counts = places.verdicts(self.tolerance_m)
-            close = f"Undecided: {_places(counts == 0)} too close to {limit} for "
+            near = counts == 0
+            undecided = f"{_places(near)} too close to {limit} for "
+            undecided += f"{'its' if near.sum() == 1 else 'their'} uncertainty"
+            if not near.any():
+                undecided = "not all of the surface has a counterpart"
             head = {
                 "pass": f"Pass: every place seen is within {limit}",
                 "fail": f"Fail: {_places(counts < 0)} outside {limit}",
-                "undecided": close + ("its" if (counts == 0).sum() == 1 else "their")
-                + " uncertainty" if (counts == 0).any()
-                else "Undecided: not all of the surface has a counterpart",
-            }  # fmt: skip
+                "undecided": f"Undecided: {undecided}",
+            }
             found = f"{head[str(self.verdict)]}; the largest deviation is {largest}"
         if self.given:
             found += f" ({self.given})"
@@ -197,7 +199,7 @@ class Comparison:
         area = 1e4 * sum(each.area_m2 for each in self.deviations.unmatched)
         return (
             f"{found} The reference lacks {area:.0f} cm\N{SUPERSCRIPT TWO} of what was measured, "
-            f"most of it round ({at}) mm, up to {words.length(first.distance_m)} away: "
+            f"most of it around ({at}) mm, up to {words.length(first.distance_m)} away: "
             "a feature is missing, additional or elsewhere, or something touches the part."
         )
 
