@@ -37,8 +37,8 @@ _DEGREES = 30.0
 _SPREAD = np.log(2.0)
 # Least factor on the errors of odometry: over short motions a phone's are smaller than stated.
 _BETTER = 0.5
-# Iterations of the robust estimate of odometry's scale.
-_ROBUST_ITERATIONS = 5
+# Iterations of the robust estimate of odometry's scale, and of this and the errors in turn.
+_ROBUST_ITERATIONS, _ROUNDS = 5, 3
 # Odometry that fewer fully constrained registrations were compared with is not verified.
 _MIN_COMPARED = 10
 # Squared disagreement, in units of tracking's errors, that one in a hundred motions of independent
@@ -418,48 +418,61 @@ class _Comparison:
     ) -> _Fit | None:
         """Most likely factors on the sigmas and scale; None if they don't explain the disagreement.
 
-        The factors of registrations and of odometry are within the given limits; for `scale_error`
-        see `OdometryEdges.scale`.
+        The factors of registrations and of odometry are within the given limits, the error of the
+        scale up to the second limit times its usual one; see `OdometryEdges.scale`.
         """
-        misfit, along = self._misfit, np.zeros((len(self.spans), 6))
-        along[:, :3] = np.einsum("kji,kj->ki", self.tracked[:, :3, :3], self.odometry[:, :3, 3])
         from scipy.optimize import minimize  # slow to import
 
         weight = 1 / self.spans  # about as many are independent as don't overlap
-
-        def excess(C: Float64) -> tuple[float, float]:
-            if scale_error == 0:
-                return 0.0, 0.0
-            weighted = np.linalg.solve(C, along[..., None])[..., 0]
-            information = weight * (weighted * along).sum(1)
-            measured = weight * (weighted * misfit).sum(1)
-            found, robust, prior = 0.0, np.ones(len(weight)), 0.0
-            for _ in range(_ROBUST_ITERATIONS):
-                prior = 2 / (scale_error**2 + found**2)
-                found = float((robust * measured).sum() / ((robust * information).sum() + prior))
-                robust = (_DEGREES + 6) / (_DEGREES + _squared(misfit - found * along, C))
-            # Motions over different numbers of frames repeat each other.
-            most = max(float(information[self.spans == n].sum()) for n in np.unique(self.spans))
-            return found, (most + prior) ** -0.5
-
-        def cost(logarithms: Float64) -> float:
-            C = self._covariances(np.exp(logarithms).reshape(2, 2))
-            e = misfit - excess(C)[0] * along
-            likelihood = 0.5 * np.linalg.slogdet(C)[1] + 0.5 * (_DEGREES + 6) * np.log1p(
-                _squared(e, C) / _DEGREES
-            )
-            prior = 0.5 * float((logarithms[2:] ** 2).sum()) / _SPREAD**2
-            return float((weight * likelihood).sum()) + prior
-
         low, high = np.log(np.repeat([registrations, odometry], 2, axis=0)).T
         bounds = list(zip(low, high, strict=True))
-        fit = minimize(cost, 0.3 * high, method="L-BFGS-B", bounds=bounds)
-        factors = np.exp(fit.x).reshape(2, 2)
-        C = self._covariances(factors)
-        found = _Fit(factors, *excess(C))
-        median = float(np.median(_squared(misfit - found.excess * along, C)))
-        explained = median <= 2 * MEDIAN and abs(found.excess) <= odometry[1] * scale_error
+        found = _Fit(np.ones((2, 2)), 0.0, scale_error)
+        # Noise first: of a camera that turns in place, another scale explains it as well.
+        for _ in range(_ROUNDS if scale_error else 1):
+            misfit = self._misfit_of(found.excess)
+
+            def cost(logarithms: Float64, misfit: Float64 = misfit) -> float:
+                C = self._covariances(np.exp(logarithms).reshape(2, 2))
+                likelihood = 0.5 * np.linalg.slogdet(C)[1] + 0.5 * (_DEGREES + 6) * np.log1p(
+                    _squared(misfit, C) / _DEGREES
+                )
+                prior = 0.5 * float((logarithms[2:] ** 2).sum()) / _SPREAD**2
+                return float((weight * likelihood).sum()) + prior
+
+            best = minimize(cost, 0.3 * high, method="L-BFGS-B", bounds=bounds).x
+            factors = np.exp(best).reshape(2, 2)
+            found = _Fit(factors, *(self._excess(factors, scale_error) if scale_error else (0, 0)))
+        chi2 = _squared(self._misfit_of(found.excess), self._covariances(found.factors))
+        explained = np.median(chi2) <= 2 * MEDIAN and abs(found.excess) <= odometry[1] * scale_error
         return found if explained else None
+
+    def _excess(self, factors: Float64, scale_error: float) -> tuple[float, float]:
+        """Return the most likely excess of lengths and its sigma, given the `factors`."""
+        W = np.linalg.inv(self._covariances(factors))
+        weight = 1 / self.spans
+        along = self._misfit_of(0.0) - self._misfit_of(1.0)
+        squared = weight * np.einsum("ki,kij,kj->k", along, W, along)
+        product = weight * np.einsum("ki,kij,kj->k", along, W, self._misfit)
+        # Noise of odometry looks like length that was not tracked (errors in variables).
+        noise = weight * self.variances[:, 0] * factors[1, 0] ** 2
+        noise *= np.trace(W[:, :3, :3], 0, 1, 2)
+
+        def signal(of: Float64) -> tuple[float, float]:
+            total = max(float((of * squared).sum()), 1e-12)
+            share = max(total - float((of * noise).sum()), 0.0) / total
+            return share, share**2 * total
+
+        found, robust, prior = 0.0, np.ones(len(weight)), 0.0
+        for _ in range(_ROBUST_ITERATIONS):
+            prior = 2 / (scale_error**2 + found**2)
+            share, information = signal(robust)
+            measured = share * float((robust * (product - noise)).sum())
+            found = measured / (information + prior)
+            e = self._misfit_of(found)
+            robust = (_DEGREES + 6) / (_DEGREES + np.einsum("ki,kij,kj->k", e, W, e))
+        # Motions over different numbers of frames repeat each other.
+        most = max(signal(np.asarray(self.spans == n, float))[1] for n in np.unique(self.spans))
+        return found, (most + prior) ** -0.5
 
     def by_length(self) -> Iterator[_Comparison]:
         """Yield those over each number of frames, if there are several."""
@@ -492,6 +505,13 @@ class _Comparison:
     def _misfit(self) -> Float64:
         """(K, 6) disagreement of the two."""
         return se3.log(se3.inverse(self.tracked) @ self.odometry)
+
+    def _misfit_of(self, excess: float) -> Float64:
+        """(K, 6) disagreement without the excess of odometry's lengths."""
+        misfit = self._misfit
+        R, t = self.tracked[:, :3, :3], self.odometry[:, :3, 3]
+        misfit[:, :3] -= excess * np.einsum("kji,kj->ki", R, t)
+        return misfit
 
     def lengths_agree(self, scales: Float64) -> bool:
         """Whether tracked lengths differ from those of the odometry by less than half (95 %)."""
