@@ -37,8 +37,6 @@ _DEGREES = 30.0
 _SPREAD = np.log(2.0)
 # Least factor on the errors of odometry: over short motions a phone's are smaller than stated.
 _BETTER = 0.5
-# Iterations of the robust estimate of odometry's scale, and of this and the errors in turn.
-_ROBUST_ITERATIONS, _ROUNDS = 5, 3
 # Odometry that fewer fully constrained registrations were compared with is not verified.
 _MIN_COMPARED = 10
 # Squared disagreement, in units of tracking's errors, that one in a hundred motions of independent
@@ -258,11 +256,11 @@ class GravityEdges(Bounded, ExternalSensor):
 class OdometryEdges(Bounded, ExternalSensor):
     """Connects consecutive frames by the motion between their poses in an odometry file.
 
-    Its errors are a scale, corrected by comparison with tracking, and random walks over time,
-    length and angle. These are scaled until they and the errors of tracking explain the
-    disagreement of the two; single steps with a far larger one are rejected. Odometry that agrees
-    with tracking better than the errors of tracking allow shares them, as if it were computed from
-    the same depth. Then it is no evidence, except where the depth has none.
+    Its errors are random walks over time, length and angle. They are scaled until these and the
+    errors of tracking explain the disagreement of the two; single steps with a far larger one are
+    rejected. Odometry that agrees with tracking better than the errors of tracking allow shares
+    them, as if it were computed from the same depth. Then it is no evidence, except where the
+    depth has none.
 
     Attributes
     ----------
@@ -270,8 +268,6 @@ class OdometryEdges(Bounded, ExternalSensor):
         Standard deviation after one second.
     relative, relative_rad
         Additional standard deviation after one metre, as a fraction; and after one radian.
-    scale
-        Usual error of all lengths together, as a fraction: the scale of a Cauchy distribution.
     limit
         Largest factor on its errors; odometry that needs more is not used.
     gate
@@ -282,7 +278,6 @@ class OdometryEdges(Bounded, ExternalSensor):
     drift_rad: Annotated[float, Bounds(1e-6, 10)] = 0.001
     relative: Annotated[float, Bounds(0, 10)] = 0.01
     relative_rad: Annotated[float, Bounds(0, 10)] = 0.003
-    scale: Annotated[float, Bounds(0, 1)] = 0.02
     limit: Annotated[float, Bounds(1)] = 5.0
     gate: Annotated[float, Bounds(0, exclusive=True)] = 40.0
 
@@ -296,32 +291,25 @@ class OdometryEdges(Bounded, ExternalSensor):
         measured = se3.inverse(sensed.odometry[first]) @ sensed.odometry[first + 1]
         variances = self._variances(measured, sensed.times[first + 1] - sensed.times[first])
         compared = _compare(sensed, graph, variances, first)
-        fit = (
-            _Fit(np.ones((2, 2)), 0.0, self.scale)
+        scales = (
+            np.ones((2, 2))
             if compared is None
-            else compared.fit((1.0, 1.0), (_BETTER, self.limit), self.scale)
+            else compared.scales((1.0, 1.0), (_BETTER, self.limit))
         )
-        if fit is None:
+        if scales is None:
             text = (
                 f"the odometry differs from the tracked motion by more than {self.limit:g} times "
                 "its errors, so it was not used"
             )
             return SensorPriors(records=(SensorRecord("odometry", len(first), 0, None, text),))
-        measured[:, :3, 3] *= 1 - fit.excess
-        # All steps share the error of the scale: along the path it adds up to no more than this.
-        length = np.linalg.norm(measured[:, :3, 3], axis=1)
-        shared_variance = np.zeros_like(variances)
-        shared_variance[:, :3] = (fit.excess_sigma**2 * length.sum() * length)[:, None]
-        factors = fit.factors[1]
-        C = (variances * np.repeat(factors**2, 3) + shared_variance)[:, :, None] * np.eye(6)
-        stated = variances * np.repeat(np.maximum(factors, 1) ** 2, 3) + shared_variance
+        odometry_scale = scales[1]
+        C = (variances * np.repeat(odometry_scale**2, 3))[:, :, None] * np.eye(6)
+        stated = (variances * np.repeat(np.maximum(odometry_scale, 1) ** 2, 3))[:, :, None]
         tracked = se3.inverse(graph.poses[first]) @ graph.poses[first + 1]
         tracking_covariance = _covariance_to_reference(graph)
         chi2 = _squared(
             se3.log(se3.inverse(tracked) @ measured),
-            stated[:, :, None] * np.eye(6)
-            + tracking_covariance[first]
-            + tracking_covariance[first + 1],
+            stated * np.eye(6) + tracking_covariance[first] + tracking_covariance[first + 1],
         )
         used = chi2 <= self.gate
         shared = compared is not None and compared.shares_errors
@@ -337,24 +325,19 @@ class OdometryEdges(Bounded, ExternalSensor):
             )
             for k in kept
         )
-        scale = float(factors.max())
+        scale = float(odometry_scale.max())
         text = f"{len(kept)} of {len(first)} steps of the odometry are used, "
         text += (
             "with the stated errors"
             if abs(scale - 1) < 0.05
             else f"with {scale:.1f} times its errors"
         )
-        if compared is not None and abs(fit.excess) > 3 * fit.excess_sigma:
-            text += (
-                f"; compared with the depth its lengths are {abs(fit.excess):.1%} too "
-                f"{'long' if fit.excess > 0 else 'short'}, which was corrected"
-            )
         if shared:
             text += (
                 ", those where images don't constrain the motion: it agrees with the tracked "
                 "motion better than the errors of the depth allow, as if it were computed from it"
             )
-        metric = compared is not None and compared.lengths_agree(fit.factors)
+        metric = compared is not None and compared.lengths_agree(scales)
         record = SensorRecord("odometry", len(first), len(kept), scale, text, metric)
         verified = compared is not None and compared.verified
         return SensorPriors(steps, records=(record,), verified=verified)
@@ -368,23 +351,6 @@ class OdometryEdges(Bounded, ExternalSensor):
             self.drift_rad**2 * seconds + self.relative_rad**2 * angle,
         ]
         return np.repeat(np.stack(variance, 1), 3, axis=1)
-
-
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """What explains the disagreement of tracking and odometry.
-
-    Attributes
-    ----------
-    factors
-        (2, 2) on the sigmas of registrations and of odometry, each of translation and of rotation.
-    excess, excess_sigma
-        Fraction of odometry's lengths that they exceed tracked ones by, and its sigma.
-    """
-
-    factors: Float64
-    excess: float
-    excess_sigma: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -410,69 +376,33 @@ class _Comparison:
     spans: Intp
     verified: bool
 
-    def fit(
-        self,
-        registrations: tuple[float, float],
-        odometry: tuple[float, float],
-        scale_error: float = 0.0,
-    ) -> _Fit | None:
-        """Most likely factors on the sigmas and scale; None if they don't explain the disagreement.
+    def scales(
+        self, registrations: tuple[float, float], odometry: tuple[float, float]
+    ) -> Float64 | None:
+        """Most likely factors on the sigmas of registrations and of odometry (2, 2).
 
-        The factors of registrations and of odometry are within the given limits, the error of the
-        scale up to the second limit times its usual one; see `OdometryEdges.scale`.
+        Each of translation and of rotation, within the given limits; None if they don't explain
+        the disagreement.
         """
+        misfit = self._misfit
         from scipy.optimize import minimize  # slow to import
 
         weight = 1 / self.spans  # about as many are independent as don't overlap
+
+        def cost(logarithms: Float64) -> float:
+            C = self._covariances(np.exp(logarithms).reshape(2, 2))
+            likelihood = 0.5 * np.linalg.slogdet(C)[1] + 0.5 * (_DEGREES + 6) * np.log1p(
+                _squared(misfit, C) / _DEGREES
+            )
+            prior = 0.5 * float((logarithms[2:] ** 2).sum()) / _SPREAD**2
+            return float((weight * likelihood).sum()) + prior
+
         low, high = np.log(np.repeat([registrations, odometry], 2, axis=0)).T
         bounds = list(zip(low, high, strict=True))
-        found = _Fit(np.ones((2, 2)), 0.0, scale_error)
-        # Noise first: of a camera that turns in place, another scale explains it as well.
-        for _ in range(_ROUNDS if scale_error else 1):
-            misfit = self._misfit_of(found.excess)
-
-            def cost(logarithms: Float64, misfit: Float64 = misfit) -> float:
-                C = self._covariances(np.exp(logarithms).reshape(2, 2))
-                likelihood = 0.5 * np.linalg.slogdet(C)[1] + 0.5 * (_DEGREES + 6) * np.log1p(
-                    _squared(misfit, C) / _DEGREES
-                )
-                prior = 0.5 * float((logarithms[2:] ** 2).sum()) / _SPREAD**2
-                return float((weight * likelihood).sum()) + prior
-
-            best = minimize(cost, 0.3 * high, method="L-BFGS-B", bounds=bounds).x
-            factors = np.exp(best).reshape(2, 2)
-            found = _Fit(factors, *(self._excess(factors, scale_error) if scale_error else (0, 0)))
-        chi2 = _squared(self._misfit_of(found.excess), self._covariances(found.factors))
-        explained = np.median(chi2) <= 2 * MEDIAN and abs(found.excess) <= odometry[1] * scale_error
-        return found if explained else None
-
-    def _excess(self, factors: Float64, scale_error: float) -> tuple[float, float]:
-        """Return the most likely excess of lengths and its sigma, given the `factors`."""
-        W = np.linalg.inv(self._covariances(factors))
-        weight = 1 / self.spans
-        along = self._misfit_of(0.0) - self._misfit_of(1.0)
-        squared = weight * np.einsum("ki,kij,kj->k", along, W, along)
-        product = weight * np.einsum("ki,kij,kj->k", along, W, self._misfit)
-        # Noise of odometry looks like length that was not tracked (errors in variables).
-        noise = weight * self.variances[:, 0] * factors[1, 0] ** 2
-        noise *= np.trace(W[:, :3, :3], 0, 1, 2)
-
-        def signal(of: Float64) -> tuple[float, float]:
-            total = max(float((of * squared).sum()), 1e-12)
-            share = max(total - float((of * noise).sum()), 0.0) / total
-            return share, share**2 * total
-
-        found, robust, prior = 0.0, np.ones(len(weight)), 0.0
-        for _ in range(_ROBUST_ITERATIONS):
-            prior = 2 / (scale_error**2 + found**2)
-            share, information = signal(robust)
-            measured = share * float((robust * (product - noise)).sum())
-            found = measured / (information + prior)
-            e = self._misfit_of(found)
-            robust = (_DEGREES + 6) / (_DEGREES + np.einsum("ki,kij,kj->k", e, W, e))
-        # Motions over different numbers of frames repeat each other.
-        most = max(signal(np.asarray(self.spans == n, float))[1] for n in np.unique(self.spans))
-        return found, (most + prior) ** -0.5
+        fit = minimize(cost, 0.3 * high, method="L-BFGS-B", bounds=bounds)
+        found = np.exp(fit.x).reshape(2, 2)
+        median = float(np.median(_squared(misfit, self._covariances(found))))
+        return found if median <= 2 * MEDIAN else None
 
     def by_length(self) -> Iterator[_Comparison]:
         """Yield those over each number of frames, if there are several."""
@@ -505,13 +435,6 @@ class _Comparison:
     def _misfit(self) -> Float64:
         """(K, 6) disagreement of the two."""
         return se3.log(se3.inverse(self.tracked) @ self.odometry)
-
-    def _misfit_of(self, excess: float) -> Float64:
-        """(K, 6) disagreement without the excess of odometry's lengths."""
-        misfit = self._misfit
-        R, t = self.tracked[:, :3, :3], self.odometry[:, :3, 3]
-        misfit[:, :3] -= excess * np.einsum("kji,kj->ki", R, t)
-        return misfit
 
     def lengths_agree(self, scales: Float64) -> bool:
         """Whether tracked lengths differ from those of the odometry by less than half (95 %)."""
@@ -590,10 +513,8 @@ def with_depth_scale(measured: SensorPriors, sensed: SensorData, graph: PoseGrap
     compared = _compare(sensed, graph, variances, first)
     if compared is None:
         return measured
-    found = [part.fit((1.0, _MAX_DEPTH_SCALE), (1.0, 1.0)) for part in compared.by_length()]
-    translation, rotation = np.max(
-        [np.ones(2), *(fit.factors[0] for fit in found if fit is not None)], 0
-    )
+    found = [part.scales((1.0, _MAX_DEPTH_SCALE), (1.0, 1.0)) for part in compared.by_length()]
+    translation, rotation = np.max([np.ones(2), *(s[0] for s in found if s is not None)], 0)
     return replace(measured, depth_scale=(float(translation), float(rotation)))
 
 
