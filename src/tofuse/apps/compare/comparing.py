@@ -387,11 +387,15 @@ def _registered(
         ):
             found = near
     T, rival = found.T_target_source, found.runner_up
-    if guess is not None and rival is not None and not found.believed:
+    if (
+        guess is not None
+        and rival is not None
+        and not found.believed
+        and _distance(points, T, guess) < _NEARER * _distance(points, rival, guess)
+    ):
         # Whoever states where the part lies excludes poses elsewhere.
-        moved = [_distance(points, pose, guess) for pose in (T, rival)]
         alone = register(points, target, guess=T, method=AnyPair(search=False))
-        if alone.believed and moved[0] < _NEARER * moved[1]:
+        if alone.believed:
             found, T = alone, alone.T_target_source
     names = []
     if rival is not None and (found.given_guess or not found.believed):

@@ -70,8 +70,8 @@ _symmetries: WeakKeyDictionary[Frame, Float64] = WeakKeyDictionary()
 _MAX_SCORE_LOSS = 0.02
 # Points used to test whether a rival converges to the best pose.
 _RIVAL_POINTS = 2500
-# Ratios of units: powers of ten, and inches, feet in mm, and inches in m; and by which power of ten
-# the extents may differ from one.
+# Ratios of units: powers of ten, an inch and a foot in mm, and a metre in inches; and the largest
+# log10 by which the ratio of the extents may differ from one of them.
 _UNIT_RATIOS = np.array([1.0, 10.0, 25.4, 1e2, 304.8, 1e3, 1 / 0.0254])
 _UNIT_RATIOS = np.concatenate([_UNIT_RATIOS, 1 / _UNIT_RATIOS[1:]])
 _MAX_UNIT_LOG = 0.5

@@ -91,9 +91,8 @@ class NerfstudioSource(FileSource):
             document, "sigma_unit_scale_factor", file, 1e-4, _REMEDY
         )
         self.metadata |= {"depth_kind": "z", "depth_unit_m": self.unit_m}
-        if all(
-            "depth_path" in frame.entry for frame in self.frames
-        ):  # a phone's, as ARKit has them
+        # The key of NeRFCapture, whose poses are those of ARKit.
+        if all("depth_path" in frame.entry for frame in self.frames):
             self.metadata[POSES_BY] = "NeRFCapture"
         if without_depth:
             self.warnings.append(f"{file}: {without_depth} frames have no depth: skipped")
