@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.compute import run_all
 from tofuse.engine.frames import RangeFrame, frame_ranges
 from tofuse.engine.fusion import Model, with_pose_errors
 from tofuse.engine.graph import LoopRecord, PoseGraph, external_sensors, graph_covariances
@@ -20,6 +22,7 @@ from tofuse.engine.mapping.tracked_graph import Optimised, Refined, TrackedGraph
 from tofuse.engine.parts import name_of
 from tofuse.engine.quality import (
     ambiguous_frames,
+    background,
     cross_view_agreement,
     pose_accuracy,
     trajectory_errors,
@@ -27,7 +30,7 @@ from tofuse.engine.quality import (
 from tofuse.engine.refinement import Refinement
 from tofuse.engine.results import Component, FrameRecord, Reason, Verdict, checks, verdicts
 from tofuse.engine.sensor import CameraErrors
-from tofuse.engine.tracking import FrameTime, given, moving_objects
+from tofuse.engine.tracking import FrameTime, given, moving_objects, rival_motions
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +119,9 @@ class Assessment:
         changes = refined.refinement.range_change is not None
         sensors = closed.sensors
         measured = frozenset(s.j for s in sensors.steps) if sensors.verified else frozenset[int]()
-        is_open = changes or checks.open_motion([*moving, *rivals], measured)
-        if ambiguous or is_open or checks.frozen(repeated):
+        confirmed = self._confirmed(graph, moving, rivals, measured)
+        is_open = checks.open_motion([*moving, *rivals], measured | confirmed)
+        if ambiguous or changes or is_open or checks.frozen(repeated):
             accuracy = accuracy.without_bound()
         if observations.has_covariances:
             model = self._with_pose_errors(model, graph, covariances)
@@ -151,6 +155,7 @@ class Assessment:
             moved=moved,
             rivals=rivals,
             measured=measured,
+            confirmed=confirmed,
             doubtful=tuple(e.record.index for e in posed if e.step is not None and e.step.doubtful),
             single_link_frames=single_link_frames(self.tracked, loops),
             ambiguous=ambiguous,
@@ -297,6 +302,33 @@ class Assessment:
             else None
         )
 
+    def _confirmed(
+        self,
+        graph: PoseGraph,
+        moving: Sequence[tuple[int, float]],
+        rivals: Sequence[tuple[int, float]],
+        measured: frozenset[int],
+    ) -> frozenset[int]:
+        """Return the frames in which much moves, and whose poses the background confirms."""
+        open_frames = checks.open_motion([*moving, *rivals], measured)
+        if not open_frames:
+            return frozenset()
+        images, rows = self._checked_images(graph, with_open=True)
+        excluded = {k: x for k, x in moving if x > moving_objects.MIN_MOVING_FRACTION}
+        rival = dict(rivals)
+        movements = {
+            k: background.Movement(excluded.get(k, 0.0), rival.get(k, 0.0))
+            for k in excluded.keys() | rival.keys()
+        }
+        limits = background.Limits(checks.MAX_MOVING, rival_motions.DELAY)
+        views = run_all(
+            [partial(cross_view_agreement.prepare_for_comparison, image) for image in images]
+        )
+        frames = graph.ids.tolist()
+        return background.confirmed(
+            views, graph.poses[rows], frames, open_frames, movements, limits
+        )
+
     def _ambiguous(self, graph: PoseGraph) -> tuple[int, ...]:
         """Return frames to which another step fits as well; odometry would exclude that."""
         posed = self.tracked.posed
@@ -310,10 +342,16 @@ class Assessment:
             views = [*views, newest]
         return ambiguous_frames(views, poses, moments)
 
-    def _checked_images(self, graph: PoseGraph) -> tuple[list[RangeFrame], Intp]:
-        """Return the images for the final comparison, and their positions in the graph."""
-        images = (image.get() for image in self.observations.checks)
-        frames = [f for f in images if f.index in self.tracked.poses]
+    def _checked_images(
+        self, graph: PoseGraph, *, with_open: bool = False
+    ) -> tuple[list[RangeFrame], Intp]:
+        """Return the images for the final comparison, and their positions in the graph.
+
+        Optionally with those in which so much moves that it is open what stands still.
+        """
+        images = {*self.observations.checks, *(self.observations.open_checks if with_open else ())}
+        frames = [f for f in (image.get() for image in images) if f.index in self.tracked.poses]
+        frames.sort(key=lambda frame: frame.index)
         row_of = {int(frame): k for k, frame in enumerate(graph.ids)}
         return frames, np.array([row_of[f.index] for f in frames], np.intp)
 

@@ -150,7 +150,7 @@ class FrameLog:
         """Add the next frame, without its images."""
         moving = 0.0
         if step is not None:
-            moving = 0.0 if step.moving is None else float(step.moving.mean())
+            moving = step.moving_fraction
             r = step.registration
             r = None if r is None else replace(r, errors=())
             step = replace(step, registration=r, surface=None, moving=None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -17,12 +17,13 @@ from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping.config import Config, checked_bytes, views_bytes
 from tofuse.engine.mapping.preparation import FilteredFrame
 from tofuse.engine.quality import cross_view_agreement, frame_samples
+from tofuse.engine.results import checks
 from tofuse.engine.stored_views import PosedView, Spacing, Spilled, ViewStore
 from tofuse.engine.tracking import Step
 from tofuse.engine.views import PreparedView
 
 _MAX_POINTS = 50_000  # of each cloud, and of each view for loops; bounds the memory of a run
-_CHECKED_IMAGES = 60  # images of the final comparison
+_CHECKED_IMAGES = 60  # images of the final comparison, and as many in which much moves
 # Width of stored views: more pixels do not improve loops and refinement.
 _COLUMNS = 200
 # Number of images of a place that are all fused into the model; of further ones a decreasing
@@ -72,6 +73,7 @@ class Observations:
         self.model = ModelBuilder(config.fusion, surface=surface)
         self._places = Spacing(views_per_place=_VIEWS_PER_PLACE).places()
         self._checks = frame_samples.EvenSample[Spilled[RangeFrame]](_CHECKED_IMAGES)
+        self._open_checks = frame_samples.EvenSample[Spilled[RangeFrame]](_CHECKED_IMAGES)
         self._checks_spill: Spill[RangeFrame] = Spill(checked_bytes(config.memory_mb))
         self.depths: dict[int, float] = {}
         self.color_depths: dict[int, float] = {}
@@ -125,11 +127,15 @@ class Observations:
             if frame.color_image is not None and frame.color_registered:
                 self.color_depths[frame.index] = depth
             if isinstance(clean, RangeFrame):
-                self._checks.offer(
-                    lambda: Spilled(
-                        cross_view_agreement.restore_thinned(frame, clean), self._checks_spill
-                    )
-                )
+
+                @cache
+                def restored() -> Spilled[RangeFrame]:
+                    image = cross_view_agreement.restore_thinned(frame, clean)
+                    return Spilled(image, self._checks_spill)
+
+                self._checks.offer(restored)
+                if max(step.moving_fraction, step.rival) > checks.MAX_MOVING:
+                    self._open_checks.offer(restored)
         assert step.T_component_camera is not None
         if self._places.keeps(depth, step.T_component_camera, step.component):
             self.model.add(clean, step.surface, _MAX_POINTS)
@@ -149,6 +155,11 @@ class Observations:
     def checks(self) -> Sequence[Spilled[RangeFrame]]:
         """Images that are compared with each other at the final poses."""
         return self._checks.items
+
+    @property
+    def open_checks(self) -> Sequence[Spilled[RangeFrame]]:
+        """Images of which so much moves that it is open what stands still."""
+        return self._open_checks.items
 
 
 def _reduced(view: PreparedView) -> PreparedView:

@@ -12,6 +12,7 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.engine.quality import (
+        background,
         cross_view_agreement,
         frame_samples,
         map_agreement,

@@ -112,6 +112,8 @@ class Evidence:
         (frame index, share of the view) of frames of which a share follows a rival motion.
     measured
         Indices of the frames whose motion verified odometry measured, and agrees with.
+    confirmed
+        Indices of the frames whose pose the background confirms, although much moves in them.
     doubtful
         Indices of the frames that fit worse than usual for this camera.
     single_link_frames
@@ -143,6 +145,7 @@ class Evidence:
     moved: tuple[int, ...] = ()
     rivals: tuple[tuple[int, float], ...] = ()
     measured: frozenset[int] = frozenset()
+    confirmed: frozenset[int] = frozenset()
     doubtful: tuple[int, ...] = ()
     single_link_frames: tuple[int, ...] = ()
     ambiguous: tuple[int, ...] = ()
@@ -441,7 +444,7 @@ def _scene(e: Evidence) -> Iterator[Reason]:
             text = words.format(_percent(largest), frame_ranges.in_words(where))
             yield Reason(code, where, f"{text} excluded from tracking and from the model.")
     parts = [*e.moving, *e.rivals]
-    if frames := open_motion(parts, e.measured):
+    if frames := open_motion(parts, e.measured | e.confirmed):
         where = e.runs_of(frames)
         largest = max(share for frame, share in parts if frame in frames)
         text = (
@@ -461,12 +464,12 @@ def _scene(e: Evidence) -> Iterator[Reason]:
         yield Reason("doubtful_poses", doubtful, f"{_sentence(doubtful)} {description}")
 
 
-def open_motion(moving: Sequence[tuple[int, float]], measured: Collection[int] = ()) -> set[int]:
+def open_motion(moving: Sequence[tuple[int, float]], decided: Collection[int] = ()) -> set[int]:
     """Return the frames in which what moves, (frame index, share of the view), is too much.
 
-    Nothing is open in frames whose motion another sensor measured, and agrees with.
+    Nothing is open in frames in which other evidence has decided what stands still.
     """
-    return {frame for frame, fraction in moving if fraction > MAX_MOVING and frame not in measured}
+    return {frame for frame, fraction in moving if fraction > MAX_MOVING and frame not in decided}
 
 
 def frozen(repeated: Sequence[frame_ranges.Range]) -> bool:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from tofuse.engine.alignment import projective
-from tofuse.engine.arrays import Float32, Float64, Intp
+from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.compute import median, run_chunks
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
@@ -207,6 +207,16 @@ class Comparison:
             score=float(per_point * (consistent - options.violation_weight * violation)),
             falloff=falloff,
         )
+
+
+def supported(
+    source: ComparedView, target: ComparedView, T_target_source: Float64, options: AgreementOptions
+) -> Bool:
+    """Return which points of a view (n,) lie on a surface of another at a pose (4, 4)."""
+    written = np.full((2, len(source.points.points)), np.nan, np.float32)
+    T = np.ascontiguousarray(T_target_source)
+    _one_direction(source.points, target, T, options, written)
+    return np.isfinite(written[1])
 
 
 def nearest_depth(view: PreparedView) -> Float32:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.tracking import given, motion_prediction, moving_objects
+    from tofuse.engine.tracking import given, motion_prediction, moving_objects, rival_motions
     from tofuse.engine.tracking.base import Odometry, Status, Step, Tracker
     from tofuse.engine.tracking.keyframes import Keyframes
     from tofuse.engine.tracking.motion import HANDHELD, FrameTime, find_jumps, reach_m

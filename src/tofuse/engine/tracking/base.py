@@ -69,6 +69,11 @@ class Step:
     moved: float = 0.0
     rival: float = 0.0
 
+    @property
+    def moving_fraction(self) -> float:
+        """Fraction of the image on moving objects."""
+        return 0.0 if self.moving is None else float(self.moving.mean())
+
 
 class Tracker(Protocol):
     """The state of an odometry method on one recording."""

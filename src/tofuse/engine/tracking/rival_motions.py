@@ -31,6 +31,8 @@ from tofuse.engine.views import PreparedView
 
 # Every n-th frame is compared, and the last comparisons count together.
 _EVERY, _WINDOW = 2, 8
+# Number of frames by which a rival is noticed late, and forgotten late.
+DELAY = _EVERY * _WINDOW
 # Motions are the same if they move the view by less than this, in cells.
 _MIN_SHIFT = 1.0
 # Largest log-likelihood ratio of a cell: that of an error of three sigmas.
