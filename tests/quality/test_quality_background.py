@@ -1,4 +1,4 @@
-"""Views from other times confirm frames in which much moves, or show that what moved was tracked."""
+"""Views from other times confirm frames in which much moves, or show that it was followed."""
 
 from __future__ import annotations
 

@@ -8,8 +8,9 @@ import pytest
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry import se3
+from tofuse.engine.tracking.keyframe_map import Keyframe
 from tofuse.engine.tracking.keyframes import Keyframes
-from tofuse.engine.tracking.rival_motions import RivalMotions, Rivalry
+from tofuse.engine.tracking.rival_motions import STANDS, STOOD, Rival, RivalMotions, Rivalry
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
 
@@ -43,16 +44,18 @@ def compared(columns: int, T: np.ndarray, rivals: dict[str, np.ndarray]) -> Riva
     """Compare a tracked motion with its rivals, where the near surface moved in between."""
     before = prepare_view(image(0, columns), SurfaceOptions())
     now = prepare_view(image(2, columns, SHIFT), SurfaceOptions())
-    return RivalMotions().compare(now, before, T, rivals, 1.0)
+    keyframe = Keyframe(before, np.eye(4), 0)
+    others = {name: Rival(keyframe, T_rival) for name, T_rival in rivals.items()}
+    return RivalMotions().compare(now, T, {STANDS: Rival(keyframe, T), **others}, 1.0)
 
 
 WITH_NEAR = se3.translation((-SHIFT * NEAR_M / FOCAL, 0.0, 0.0))
 
 
 def test_camera_that_follows_near_surface_is_noticed() -> None:
-    share, winner, rest = compared(110, WITH_NEAR, {"stands": np.eye(4)})
+    share, winner, rest = compared(110, WITH_NEAR, {STANDS: np.eye(4)})
     assert share > 0.5
-    assert winner == "stands"
+    assert winner == STANDS
     assert 0.25 < rest < 0.75  # the near surface is larger in the image, and still is open
 
 
@@ -69,14 +72,14 @@ def test_small_near_surface_leaves_nothing_open() -> None:
 
 
 def test_equal_motions_are_no_rivals() -> None:
-    assert compared(110, np.eye(4), {"stands": np.eye(4)}) == Rivalry(0.0)
+    assert compared(110, np.eye(4), {STANDS: np.eye(4)}) == Rivalry(0.0)
 
 
 def test_rival_that_everything_follows_leaves_nothing_open() -> None:
     """The tracked motion was wrong, and nothing else moves."""
-    share, winner, rest = compared(0, WITH_NEAR, {"stands": np.eye(4)})
+    share, winner, rest = compared(0, WITH_NEAR, {STANDS: np.eye(4)})
     assert share > 0.9
-    assert winner == "stands"
+    assert winner == STANDS
     assert rest < 0.1
 
 
@@ -92,9 +95,34 @@ def test_somebody_near_does_not_take_the_camera_along(columns: int) -> None:
         assert np.linalg.norm(step.T_component_camera[:3, 3]) < 0.02
 
 
-@pytest.mark.parametrize(("winner", "left"), [("stands", 0.1), ("", 0.9)])
+@pytest.mark.parametrize(("winner", "left"), [(STANDS, 0.1), ("", 0.9)])
 def test_adopted_rival_leaves_open_what_does_not_follow_it(monkeypatch, winner, left) -> None:
     monkeypatch.setattr(RivalMotions, "compare", lambda *_: Rivalry(0.9, winner, 0.1))
     tracker = Keyframes().start(0)
     steps = [tracker.push(image(k, 0)) for k in range(2)]
     assert steps[1].rival == left
+
+
+def test_what_moves_slowly_is_noticed_in_the_long_run() -> None:
+    """From view to view the far surface agrees with either motion."""
+    tracker = Keyframes().start(0)
+    steps = [tracker.push(image(k, 110, k)) for k in range(20)]
+    followed = [np.linalg.norm(step.T_component_camera[:3, 3]) for step in steps]
+    assert max(followed) > 0.06
+    assert followed[-1] < 0.02
+    assert max(step.rival for step in steps) > 0.25
+
+
+def test_camera_that_moves_does_not_stand_since_long_ago() -> None:
+    views = [prepare_view(image(k, 0), SurfaceOptions()) for k in range(4)]
+    rivals = RivalMotions()
+    first = Keyframe(views[0], np.eye(4), 0)
+    rivals.compare(views[1], np.eye(4), {STANDS: Rival(first, np.eye(4))}, 1.0)
+    assert rivals.stood_since is first
+    # Nothing is seen of the view of long ago.
+    away = se3.translation((3.0, 0.0, 0.0))
+    now = Keyframe(views[2], away, 0)
+    others = {STANDS: Rival(now, away), STOOD: Rival(first, np.eye(4))}
+    rivals.compare(views[2], away, others, 1.0)
+    rivals.compare(views[3], away, others, 1.0)
+    assert rivals.stood_since is now

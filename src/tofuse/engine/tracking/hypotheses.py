@@ -24,7 +24,13 @@ from tofuse.engine.tracking.moving_objects import (
     MovingObjects,
     without_pixels,
 )
-from tofuse.engine.tracking.rival_motions import RivalMotions, likelihood_ratios
+from tofuse.engine.tracking.rival_motions import (
+    STANDS,
+    STOOD,
+    Rival,
+    RivalMotions,
+    likelihood_ratios,
+)
 from tofuse.engine.views import PreparedView
 
 # Minimum score of a rotated start relative to the unrotated one: a flat wall fits under any.
@@ -283,7 +289,7 @@ class Hypotheses:
             hypothesis.view.planes[..., 3]
         )
         if moving.reliable and moving.fraction - excluded / view.pixels > MIN_MOVING_FRACTION:
-            static = self._without_moving(moving, T, hypothesis)
+            static = self._without_moving(moving, T, keyframe, predicted=hypothesis.predicted)
             if static.fit.is_usual or not hypothesis.fit.is_usual:
                 hypothesis = static
                 moving = self._moving(static.T_component_camera, keyframe, suspected=suspected)
@@ -306,34 +312,35 @@ class Hypotheses:
             step = se3.inverse(state.last.T_component_camera) @ accepted.T_component_camera
             if float(se3.angle(step)) > _MAX_STEP_RAD:
                 return accepted, moving, 0.0
-        T_rivals = {"stands": keyframe.T_component_camera}
+        rivals = {STANDS: Rival(keyframe, keyframe.T_component_camera)}
+        stood = state.rivals.stood_since
+        if stood is not None and stood.view.index != keyframe.view.index:
+            rivals[STOOD] = Rival(stood, stood.T_component_camera)
         if self.T_predicted is not None:
-            T_rivals["goes on"] = self.T_predicted
-        to_keyframe = se3.inverse(keyframe.T_component_camera)
+            rivals["goes on"] = Rival(keyframe, self.T_predicted)
+        scale = state.objects.typical_scale
         share, winner, rest = state.rivals.compare(
-            self.view,
-            keyframe.view,
-            accepted.T_keyframe_camera,
-            {name: to_keyframe @ T for name, T in T_rivals.items()},
-            state.objects.typical_scale,
+            self.view, accepted.T_component_camera, rivals, scale
         )
         if not winner:
             return accepted, moving, share
-        T = T_rivals[winner]
+        keyframe, T = rivals[winner]
+        to_keyframe = se3.inverse(keyframe.T_component_camera)
         ratios = likelihood_ratios(
             self.view,
             keyframe.view,
-            accepted.T_keyframe_camera,
+            to_keyframe @ accepted.T_component_camera,
             to_keyframe @ T,
-            state.objects.typical_scale,
+            scale,
         )
         with_objects = self._moving(T, keyframe, suspected=True)
         with_objects = state.objects.with_cells(with_objects, ~(ratios >= 0))
-        static = self._without_moving(with_objects, T, accepted)
+        static = self._without_moving(with_objects, T, keyframe, predicted=accepted.predicted)
         if not with_objects.reliable or not static.fit.is_usual:
             return accepted, moving, share
+        state.keyframes.remove_after(keyframe)  # they followed what moves
         state.objects.update(with_objects)
-        state.rivals.reset()
+        state.rivals.reset(keyframe if winner in (STANDS, STOOD) else None)
         state.motion.rest_at(static.T_component_camera, self.now)
         return static, with_objects, rest
 
@@ -379,7 +386,7 @@ class Hypotheses:
             moving = self._moving(T, keyframe, suspected=True)
             if not moving.reliable or moving.fraction <= MIN_MOVING_FRACTION:
                 continue
-            static = self._without_moving(moving, T, hypothesis)
+            static = self._without_moving(moving, T, keyframe, predicted=hypothesis.predicted)
             if self.state.objects.in_last_view:
                 yield static
                 continue
@@ -393,14 +400,15 @@ class Hypotheses:
             self.view, T, keyframe.view, keyframe.T_component_camera, suspected=suspected
         )
 
-    def _without_moving(self, moving: Moving, T: Float64, hypothesis: Hypothesis) -> Hypothesis:
-        """Realign a hypothesis from T (4, 4), without moving objects."""
-        k = hypothesis.keyframe
+    def _without_moving(
+        self, moving: Moving, T: Float64, keyframe: Keyframe, *, predicted: bool
+    ) -> Hypothesis:
+        """Realign the view from T (4, 4) with a keyframe, without moving objects."""
         target = projective.Target(
-            moving.applied_to_reference(k.view), se3.inverse(k.T_component_camera)
+            moving.applied_to_reference(keyframe.view), se3.inverse(keyframe.T_component_camera)
         )
         view = moving.applied(self.view)
-        return self.realigned(T, view, Reference(k, target), predicted=hypothesis.predicted)
+        return self.realigned(T, view, Reference(keyframe, target), predicted=predicted)
 
     def _hypothesis(
         self,

@@ -83,6 +83,14 @@ class KeyframeMap:
         if len(self._keyframes) > CAPACITY:
             del self._keyframes[self._most_redundant()]
 
+    def remove_after(self, keyframe: Keyframe) -> None:
+        """Remove the later keyframes of its component."""
+        self._keyframes = [
+            k
+            for k in self._keyframes
+            if k.component != keyframe.component or k.view.index <= keyframe.view.index
+        ]
+
     def is_far(self, T_component_camera: Float64, keyframe: Keyframe) -> bool:
         """Whether a pose (4, 4) is so far from a keyframe that its view becomes the next one."""
         T_keyframe_camera = se3.inverse(keyframe.T_component_camera) @ T_component_camera

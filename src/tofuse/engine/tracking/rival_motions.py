@@ -4,7 +4,9 @@ A crowd that walks past a camera at rest looks like a crowd at rest that a camer
 person near the camera may fill most of the image. So the motion of each view is compared with
 rivals: that the camera stands still, and that it goes on as before. Parts of the view that both
 explain say nothing. Elsewhere each cell yields a likelihood ratio: of depth, or of the pattern of
-the albedo on surfaces that both motions map onto themselves.
+the albedo on surfaces that both motions map onto themselves. As what is near may move slowly, and
+what is far then shows it only in the long run, a third rival is that the camera stands since the
+first view of which nothing has refuted that.
 
 The shares of the view that follow either motion are those of the mixture of both with the largest
 likelihood, over a window of frames. They are counted by solid angle and by area of surface: what is
@@ -26,6 +28,7 @@ from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
 from tofuse.engine.geometry import homogeneous, se3
 from tofuse.engine.search import pair_agreement
 from tofuse.engine.tracking import moving_object_kernels as kernels
+from tofuse.engine.tracking.keyframe_map import Keyframe
 from tofuse.engine.tracking.moving_objects import compared, stride_of
 from tofuse.engine.views import PreparedView
 
@@ -45,6 +48,8 @@ _PATTERN = 9
 # Width of the squares whose mean likelihood ratio counts: parts of a view are larger than that, and
 # errors of single cells average out.
 _REGION = 5
+# Names of the rivals that the camera has not moved since the keyframe, and since `stood_since`.
+STANDS, STOOD = "stands", "stood"
 _LOWER_QUARTILE = 0.3186  # of the absolute values of a normal distribution
 _MIN_RESIDUALS = 50
 # Number of cells that share an error, and the log-likelihood ratio to one motion alone above which
@@ -74,24 +79,37 @@ class Rivalry(NamedTuple):
     rest: float = 0.0
 
 
+class Rival(NamedTuple):
+    """Another pose (4, 4) of a view in its component, and the keyframe to compare the view with."""
+
+    keyframe: Keyframe
+    T_component_camera: Float64
+
+
 class RivalMotions:
-    """Compares the tracked motion with its rivals, from frame to frame."""
+    """Compares the tracked motion with its rivals, from frame to frame.
+
+    Attributes
+    ----------
+    stood_since
+        The keyframe since which nothing refutes that the camera stands; None after a `reset`.
+    """
 
     def __init__(self) -> None:
+        self.stood_since: Keyframe | None = None
         self._windows: dict[str, deque[Float64]] = {}
         self._share, self._views = 0.0, 0
 
-    def reset(self) -> None:
-        """Forget the last frames."""
+    def reset(self, stood_since: Keyframe | None = None) -> None:
+        """Forget the last frames, but not since when the camera stands, if it does."""
         self._windows.clear()
-        self._share = 0.0
+        self._share, self.stood_since = 0.0, stood_since
 
     def compare(
         self,
         view: PreparedView,
-        reference: PreparedView,
-        T_reference_view: Float64,
-        rivals: Mapping[str, Float64],
+        T_component_camera: Float64,
+        rivals: Mapping[str, Rival],
         scale: float,
     ) -> Rivalry:
         """Compare a view if it is one of every second, and judge the last ones.
@@ -100,12 +118,10 @@ class RivalMotions:
 
         Parameters
         ----------
-        view, reference
-            The view, and the one it was aligned with.
-        T_reference_view
-            (4, 4) the tracked motion.
+        view, T_component_camera
+            The view, and its (4, 4) pose as tracked.
         rivals
-            Other motions (4, 4), by name.
+            By name: `STANDS`, and others.
         scale
             Factor of the sigmas of depth.
         """
@@ -113,14 +129,20 @@ class RivalMotions:
         if self._views % _EVERY != 1:
             return Rivalry(self._share)
         self._share, winner, rest = 0.0, "", 0.0
-        tracked = _Tracked(view, reference, T_reference_view, scale)
-        for name, T in rivals.items():
+        for name, (keyframe, T_rival) in rivals.items():
+            T_keyframe_component = se3.inverse(keyframe.T_component_camera)
+            T, T_rival = T_keyframe_component @ T_component_camera, T_keyframe_component @ T_rival
+            tracked = _Tracked(view, keyframe.view, T, scale)
             window = self._windows.setdefault(name, deque(maxlen=_WINDOW))
-            window.append(tracked.histograms(T))
+            window.append(tracked.histograms(T_rival, shortcut=name != STOOD))
+            if name == STOOD and (tracked.refutes(window[-1]) or not tracked.overlaps):
+                self.stood_since = None
             of_cells, of_area = (_share(weights) for weights in np.sum(window, axis=0))
             self._share = max(self._share, of_cells, of_area)
             if not winner and of_area > 0.5 and window[-1].any():
                 winner, rest = name, 1 - min(of_cells, of_area)
+        if self.stood_since is None:
+            self.stood_since = rivals[STANDS].keyframe
         return Rivalry(self._share, winner, rest)
 
 
@@ -133,6 +155,17 @@ class _Tracked:
     T_reference_view: Float64
     scale: float
 
+    @property
+    def overlaps(self) -> bool:
+        """Whether the views overlap in more than half of the smaller one."""
+        views = self.view, self.reference
+        valid = [np.count_nonzero(v.z[:: stride_of(v), :: stride_of(v)]) for v in views]
+        return bool(2 * np.count_nonzero(self._forward) > min(valid))
+
+    def refutes(self, histograms: Float64) -> bool:
+        """Whether nothing follows a rival, with these histograms, although it could be seen."""
+        return bool(not self._settled and histograms.any()) and not any(map(_share, histograms))
+
     @cached_property
     def _forward(self) -> UInt8:
         return _outcome(self.view, self.reference, self.T_reference_view, self.scale)
@@ -142,13 +175,16 @@ class _Tracked:
         T = se3.inverse(self.T_reference_view)
         return _outcome(self.reference, self.view, T, self.scale)
 
-    def histograms(self, T_rival: Float64) -> Float64:
-        """Return histograms (2, B) of likelihood ratios: by number of cells, and by area."""
+    def histograms(self, T_rival: Float64, *, shortcut: bool) -> Float64:
+        """Return histograms (2, B) of likelihood ratios: by number of cells, and by area.
+
+        With a shortcut, all that agrees is against a rival that can't matter.
+        """
         total = np.zeros((2, len(_CENTRES)))
         T = self.T_reference_view
         if _shift(self.view, se3.inverse(T) @ T_rival) < _MIN_SHIFT:
             return total
-        if self._settled:
+        if self._settled and shortcut:
             total[:, 0] = self._settled
             return total
         for a, b, motions, outcome in (
