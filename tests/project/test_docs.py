@@ -156,6 +156,19 @@ def test_files_named_in_documents_exist(name: str) -> None:
             assert any((base / path).exists() for base in bases), f"{name} names {code}"
 
 
+def test_modules_named_in_sources_exist() -> None:
+    """Names `room.module` in docstrings and comments: no module has moved since."""
+    package = ROOT / "src" / "tofuse"
+    rooms: dict[str, set[str]] = {}
+    for path in package.rglob("*"):
+        rooms.setdefault(path.stem, set()).add(path.parent.name)
+    for path in package.rglob("*.py"):
+        for room, module in re.findall(r"`([a-z_]+)\.(\w+)[.\w]*`", path.read_text("utf-8")):
+            is_file = module in {"html", "js", "ply", "glb", "usdz"}
+            if module in rooms and not is_file and room not in {"tofuse", "platform"}:
+                assert room in rooms[module], f"{path} names {room}.{module}"
+
+
 def test_every_benchmark_is_listed() -> None:
     listed = codes(text_of("benchmarks/README.md"))
     for path in (ROOT / "benchmarks").glob("*.py"):

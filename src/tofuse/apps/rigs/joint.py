@@ -61,7 +61,7 @@ _CORRELATED_PIXELS = 12.0
 # Correlation length of errors (to 1/e), and size of regions of space with equal errors, as
 # fractions of the depth.
 _REACH, _REGION = 0.31, 0.1
-# As in `registration.uncertainty`; largest sigma of a constrained direction, and the sigma of an
+# As in `alignment.uncertainty`; largest sigma of a constrained direction, and the sigma of an
 # unconstrained one, in units of 1 cm and 1 degree.
 _STEEPNESS, _MAX_SIGMA, _UNCONSTRAINED_SIGMA = 0.3, 3.0, 30.0
 # Standard deviation of the systematic error of a camera's ranges, as a fraction of the range:

@@ -49,7 +49,7 @@ class Registration:
         Whether the pose is verified; None for methods that don't verify. `converged` does not imply
         it: iterations converge at wrong poses too.
     probability
-        That the pose is right, 0 to 1, see `registration.pose_probability`; None for methods that
+        That the pose is right, 0 to 1, see `search.pose_probability`; None for methods that
         don't estimate it.
     reason
         Why the pose is rejected, in words; empty otherwise.

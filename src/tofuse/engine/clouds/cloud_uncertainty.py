@@ -1,6 +1,6 @@
 """Covariance of the pose between two point clouds.
 
-As for images (`registration.uncertainty`) the covariance is that of an M-estimate, ``X^-1 B X^-1``
+As for images (`alignment.uncertainty`) the covariance is that of an M-estimate, ``X^-1 B X^-1``
 (Huber 1981, ch. 6): X is the Hessian, from the product of both views' normals, in which their
 noise cancels, and B the covariance of the gradient. The error model of a cloud is unknown, so B is
 estimated from the residuals at the final pose. The relative distortion of the clouds, by

@@ -40,7 +40,7 @@ class Source(Protocol):
         (N, 4, 4) T_world_camera from odometry, NaN where unknown; or None.
     gravity
         (N, 4) unit vector along gravity in the camera's frame, and its standard deviation in rad
-        (`recordings.imu`), NaN where unknown; or None.
+        (`sources.imu`), NaN where unknown; or None.
     warnings
         Notes for the user on how the recording was read so far, one line each.
     metadata

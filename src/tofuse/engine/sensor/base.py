@@ -82,7 +82,7 @@ class Correction(Protocol):
 
     @property
     def needs_trial(self) -> bool:
-        """Whether a trial on the recording (`pipeline.trial`) decides if it is used."""
+        """Whether a trial on the recording (`mapping.trial`) decides if it is used."""
         return False
 
     @property

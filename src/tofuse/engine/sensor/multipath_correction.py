@@ -90,7 +90,7 @@ class Multipath(Bounded, Correction):
         """See `Correction.after_trial`.
 
         The correction is not scaled by the strength, whose estimate is biased low
-        (`pipeline.trial`), while the gain has been estimated from the recording. Its standard error
+        (`mapping.trial`), while the gain has been estimated from the recording. Its standard error
         is added to `relative_sigma`.
         """
         if not np.isfinite([strength, error]).all():

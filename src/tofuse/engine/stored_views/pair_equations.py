@@ -40,7 +40,7 @@ _USUAL_SCALES = 0.0, 1.0, 0.1
 
 @dataclass(frozen=True)
 class Round:
-    """Iterations with the same noise inflation: as in `registration.projective.Level`."""
+    """Iterations with the same noise inflation: as in `projective.Level`."""
 
     iterations: int
     inflation_m: float
@@ -107,7 +107,7 @@ class DirectedPairs:
     sources
         Points of all views.
     rows
-        (P, SIZE) sums of each pair, in the order of `kernels.pair_equations`.
+        (P, SIZE) sums of each pair, in the order of `pair_equation_kernels`.
     sums
         (P, PATCHES, PATCH_SIZE) the same sums for each patch of the target; empty unless needed.
     """

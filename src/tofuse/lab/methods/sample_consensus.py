@@ -2,7 +2,7 @@
 
 RANSAC (Fischler and Bolles 1981; section 2.5.2 of the thesis) draws random triples until one of
 them is free of outliers with the required confidence. With few inliers, such as one in fifty, that
-takes too many samples (`registration.consensus` takes sets of compatible pairs instead).
+takes too many samples (`clouds.robust_motion` takes sets of compatible pairs instead).
 """
 
 from __future__ import annotations

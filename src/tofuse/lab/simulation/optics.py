@@ -206,7 +206,7 @@ def direct_irradiance(
 
 
 def pixel_phasors(grid: RayGrid, returns: Returns, frequency: float) -> Float64:
-    """Direct light in each pixel, (H, W, 7) in the channels of `lab.kernels.phasor`."""
+    """Direct light in each pixel, (H, W, 7) in the channels of `phasor_kernels`."""
     return _pool(grid, returns.strength, returns.path, frequency)
 
 
@@ -271,7 +271,7 @@ def single_bounce_light(
 
     Returns
     -------
-    For each frequency (H, W, 7) in the channels of `lab.kernels.phasor`.
+    For each frequency (H, W, 7) in the channels of `phasor_kernels`.
     """
     step = max(4, points.shape[1] // 44)
     samples = (slice(step // 2, None, step), slice(step // 2, None, step))
