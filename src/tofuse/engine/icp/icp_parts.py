@@ -16,7 +16,7 @@ from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame
-from tofuse.engine.geometry import KdTree
+from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.icp import icp_kernels, interfaces, surface_shape
 from tofuse.engine.parts import part
 
@@ -191,10 +191,8 @@ class PointToPoint(interfaces.Metric):
             raise RegistrationError("the corresponding points lie on a line")
         if np.linalg.det(U) * np.linalg.det(Vt) < 0:
             Vt[2] *= -1
-        T = np.eye(4)
-        T[:3, :3] = (U @ Vt).T
-        T[:3, 3] = m0 - T[:3, :3] @ d0
-        return T
+        R = (U @ Vt).T
+        return se3.pose(R, m0 - R @ d0)
 
     def information(self, matches: interfaces.Matches, alignment: interfaces.Alignment) -> Float64:
         """Return ``sum w J^T J / sigma^2`` with ``J = R [I, -hat(p)]``, p in the source's frame.

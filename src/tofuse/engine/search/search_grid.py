@@ -280,9 +280,7 @@ def _non_maximum_suppression(
     R, x = R[order], x[order]
     depth = 0.5 * (scorer.source.depth + scorer.target.depth)
     chosen = kernels.select_distinct(R, x, depth, 1.5 * scorer.reach, count)
-    poses = np.tile(np.eye(4), (len(chosen), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = R[chosen], x[chosen]
-    return poses
+    return se3.pose(R[chosen], x[chosen])
 
 
 def refine_poses(

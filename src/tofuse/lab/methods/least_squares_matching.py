@@ -227,10 +227,7 @@ class LeastSquaresMatching(Bounded, Registrar):
 
 def _information_in_source(N: Float64, T_target_source: Float64, centroid: Float64) -> Float64:
     """Convert information (6, 6) about `centroid`, in the target's axes, to `Registration`'s."""
-    rotation, translation = np.zeros((6, 6)), np.eye(4)
-    rotation[:3, :3] = rotation[3:, 3:] = T_target_source[:3, :3]
-    translation[:3, 3] = -centroid
-    J = rotation @ se3.adjoint(translation)
+    J = se3.adjoint(se3.pose(T_target_source[:3, :3]) @ se3.translation(-centroid))
     H = J.T @ N @ J
     return np.asarray((H + H.T) / 2)
 

@@ -46,15 +46,10 @@ class Symmetric(surface_metrics.SurfaceMetric):
         x = surface_metrics.solve(H, g, 2 * pairs.size)
         tangent = float(np.linalg.norm(x[3:]))
         angle = math.atan(tangent)
-        half = np.eye(4)
-        if tangent > 0:
-            half[:3, :3] = se3.so3_exp(x[3:] * (angle / tangent))
-        translation, T_centre, T_uncentre = np.eye(4), np.eye(4), np.eye(4)
-        translation[:3, 3] = x[:3] * math.cos(angle)
-        T_centre[:3, 3] = pairs.centre + centre
-        T_uncentre[:3, 3] = -T_centre[:3, 3]
+        half = se3.pose(se3.so3_exp(x[3:] * (angle / tangent if tangent > 0 else 0.0)))
+        motion = half @ se3.translation(x[:3] * math.cos(angle)) @ half
         T = pairs.T_target_source
-        return T @ T_centre @ half @ translation @ half @ T_uncentre @ se3.inverse(T)
+        return T @ se3.about(pairs.centre + centre, motion) @ se3.inverse(T)
 
     def fit(self, pairs: surface_metrics.SurfacePairs) -> tuple[Float64, float]:
         """See `SurfaceMetric.fit`: along the mean normal."""

@@ -56,12 +56,8 @@ def peaks_cameras() -> Float64:
     a = 2 * np.pi * np.arange(CAMERAS) / CAMERAS
     zero = np.zeros(CAMERAS)
     position = RADIUS_M * np.stack([np.sin(a), zero, -np.cos(a)], -1)
-    T = np.tile(np.eye(4), (CAMERAS, 1, 1))
-    T[:, :3, 1] = [0, -1, 0]
-    T[:, :3, 2] = -position / RADIUS_M
-    T[:, :3, 0] = np.cross(T[:, :3, 1], T[:, :3, 2])
-    T[:, :3, 3] = position
-    return T
+    down, forward = np.broadcast_to([0.0, -1, 0], position.shape), -position / RADIUS_M
+    return se3.pose(np.stack([np.cross(down, forward), down, forward], -1), position)
 
 
 def peaks_visible() -> list[Intp]:

@@ -43,8 +43,7 @@ def camera_turn(T_room_camera: Float64, seconds: float, axis_offset_m: float = 0
 
     `axis_offset_m` is the distance of the optical centre in front of the stand's axis.
     """
-    arm = np.eye(4)
-    arm[2, 3] = axis_offset_m
+    arm = se3.translation((0, 0, axis_offset_m))
     stand = T_room_camera @ se3.inverse(arm)
 
     def path(t: float) -> Float64:
@@ -60,7 +59,7 @@ def object_turn(seconds: float) -> Path:
 
 def rotation(w: ArrayLike) -> Float64:
     """Rotation (4, 4) by a rotation vector (3,) in rad."""
-    return se3.exp(np.concatenate([np.zeros(3), np.asarray(w, float)]))
+    return se3.pose(se3.so3_exp(w))
 
 
 def smooth_step(u: float) -> float:
@@ -77,9 +76,7 @@ def out_and_back(
 
     def path(t: float) -> Float64:
         progress = smooth_step(t / out) - smooth_step((t - out) / (seconds - out))
-        step = np.eye(4)
-        step[0, 3] = length_m * progress
-        return T_room_camera @ step
+        return T_room_camera @ se3.translation((length_m * progress, 0, 0))
 
     return path
 
