@@ -198,9 +198,15 @@ def is_within(T: ArrayLike, metres: float, rad: float) -> bool:
 
 
 def lengths(T: ArrayLike) -> Float64:
-    """Lengths, m, and angles, rad, (K, 2) of motions (K, 4, 4)."""
+    """Lengths, m, and angles, rad, (..., 2) of motions (..., 4, 4)."""
     T = np.asarray(T, float)
-    return np.stack([np.linalg.norm(T[:, :3, 3], axis=1), angle(T)], axis=1)
+    return np.stack([np.linalg.norm(T[..., :3, 3], axis=-1), angle(T)], axis=-1)
+
+
+def change_of_view(T: ArrayLike, depth: ArrayLike) -> Float64:
+    """How far motions (..., 4, 4) move a view of this depth, m: as a fraction of it, plus rad."""
+    length, rotation = np.moveaxis(lengths(T), -1, 0)
+    return np.asarray(length / np.asarray(depth) + rotation)
 
 
 def largest_sigmas(C: ArrayLike) -> Float64:

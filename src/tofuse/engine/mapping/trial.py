@@ -334,8 +334,7 @@ class _AlignedViews:
         """Return the motion relative to the desired one."""
         view, T = self._view(k), step.T_world_source
         depth = 1.0 if view is None else view.surface.depth
-        distance = float(np.linalg.norm(T[:3, 3]))
-        return max(float(se3.angle(T)) / _DESIRED_ANGLE, distance / (_DESIRED_DISTANCE * depth))
+        return float((se3.lengths(T) / (_DESIRED_DISTANCE * depth, _DESIRED_ANGLE)).max())
 
     def run(self, start: int, stride: int) -> tuple[list[_TrialView], Float64]:
         """Return aligned views from `start` on, and their poses (N, 4, 4) relative to the first."""
