@@ -24,6 +24,7 @@ from tofuse.engine.loops.merged_components import (
     motion_over,
     transformed,
 )
+from tofuse.engine.normal import robust_sigma
 from tofuse.engine.search import (
     are_distinct_poses,
     follow,
@@ -98,7 +99,7 @@ class JoinChecks:
                 contradictions.append(result.contradiction)
         if len(contradictions) > 3:
             median = float(np.median(contradictions))
-            spread = 1.48 * float(np.median(np.abs(np.array(contradictions) - median)))
+            spread = robust_sigma(np.array(contradictions) - median)
             limit = median + _SIGMAS * max(spread, _MIN_SPREAD)
             self.max_contradiction = max(self.max_contradiction, min(limit, _MAX_CONTRADICTION))
 
@@ -114,9 +115,7 @@ class JoinChecks:
         Ta = np.stack([self._merged.T_merged(a, v.index) for v in views_a])
         Tb = np.stack([T_a_b @ self._merged.T_merged(b, v.index) for v in views_b])
         for p, v in enumerate(views_a):
-            relative = se3.inverse(Ta[p]) @ Tb
-            translation = np.linalg.norm(relative[:, :3, 3], axis=1) / v.depth
-            distance = translation + np.asarray(se3.angle(relative))
+            distance = se3.change_of_view(se3.inverse(Ta[p]) @ Tb, v.depth)
             candidates += [
                 (float(distance[q]), p, int(q))
                 for q in np.flatnonzero(distance < verification.MAX_OVERLAP_DISTANCE)

@@ -31,6 +31,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import run_all
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.mapping.trial import pooled
+from tofuse.engine.normal import robust_sigma
 from tofuse.engine.search import pair_agreement, verification
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view, residual_kernels
 
@@ -276,5 +277,5 @@ def _slope(source: PreparedView, target: PreparedView, T: Float64, law: Law) -> 
         slope = float(x @ (y[inliers] - y[inliers].mean()) / squares)
         residual = y - slope * log_change
         residual -= np.median(residual[inliers])
-        inliers = np.abs(residual) < 3 * 1.48 * float(np.median(np.abs(residual[inliers]))) + 1e-9
+        inliers = np.abs(residual) < 3 * robust_sigma(residual[inliers]) + 1e-9
     return _Slope(slope, squares, motion)

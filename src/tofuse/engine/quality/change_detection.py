@@ -28,7 +28,7 @@ from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.compute import run_all
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.normal import MEDIAN_OF_NORMAL
+from tofuse.engine.normal import robust_sigma
 from tofuse.engine.search import ViewPoints, pair_agreement
 from tofuse.engine.views import PreparedView
 
@@ -212,7 +212,7 @@ def _noise_scale(views: Sequence[_SessionView]) -> float:
     r, sigma = _residuals([pairs[k] for k in evenly_spaced(np.arange(len(pairs)), _MAX_PAIRS)])
     if not len(r):
         return 1.0
-    return max(float(np.quantile(r / sigma, 0.5)) / MEDIAN_OF_NORMAL, 1.0)
+    return max(robust_sigma(r / sigma), 1.0)
 
 
 def _misalignment(
@@ -224,7 +224,7 @@ def _misalignment(
     r, sigma = _residuals([facing[k] for k in sampled])
     if not len(r):
         return 0.0
-    total = float(np.quantile(r, 0.5)) / MEDIAN_OF_NORMAL
+    total = robust_sigma(r)
     noise = scale * float(np.sqrt((sigma**2).mean()))
     return float(np.sqrt(max(total**2 - noise**2, 0.0)))
 
