@@ -245,6 +245,7 @@ def test_frames_are_sampled_evenly() -> None:
     assert evenly_spaced(np.arange(101), 5).tolist() == [0, 25, 50, 75, 100]
     assert evenly_spaced(np.array([3, 8, 9]), 2).tolist() == [3, 9]
     assert evenly_spaced(np.arange(0), 5).tolist() == []
+    assert evenly_spaced("abcde", 3) == ["a", "c", "e"]
 
 
 def test_poses_are_assigned_to_nearest_frame() -> None:

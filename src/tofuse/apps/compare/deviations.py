@@ -15,11 +15,11 @@ import numpy as np
 from scipy.stats import norm
 
 from tofuse.apps.compare.nearest import Distances, Reach, Reference
-from tofuse.apps.compare.surface import Surface, spacing_of, unit_vectors
+from tofuse.apps.compare.surface import Surface, spacing_of
 from tofuse.apps.compare.unmatched import FEWEST, Unmatched, unmatched
 from tofuse.apps.report import scene
 from tofuse.engine.arrays import Bool, Float64, Intp
-from tofuse.engine.geometry import KdTree, se3
+from tofuse.engine.geometry import KdTree, se3, unit_vectors
 from tofuse.engine.normal import robust_sigma
 
 # Points of the fit, first of a sample, and of the map; and iterations.

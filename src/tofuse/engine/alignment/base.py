@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import Frame
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, unit_vectors
 
 # Minimum probability of a pose that other evidence may confirm.
 PROBABLE = 0.5
@@ -200,14 +200,12 @@ class Registration:
         adjoint, inverse_adjoint = (
             se3.adjoint(T) for T in (T_reference_b, se3.inverse(T_reference_b))
         )
-        unobservable = self.unobservable @ inverse_adjoint.T
-        lengths = np.linalg.norm(unobservable, axis=1, keepdims=True)
         runner_up = self.runner_up
         return replace(
             self,
             T_target_source=T_a_target @ self.T_target_source @ T_source_b,
             information=adjoint.T @ self.information @ adjoint,
-            unobservable=unobservable / np.maximum(lengths, 1e-12),
+            unobservable=unit_vectors(self.unobservable @ inverse_adjoint.T),
             reference_point=np.zeros(3),
             runner_up=None if runner_up is None else T_a_target @ runner_up @ T_source_b,
         )

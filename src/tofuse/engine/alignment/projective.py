@@ -19,6 +19,7 @@ from tofuse.engine.alignment.base import Registration
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute import median
+from tofuse.engine.geometry import unit_vectors
 from tofuse.engine.views import PreparedView, SurfaceOptions
 from tofuse.engine.views import residual_kernels as kernels
 
@@ -221,8 +222,6 @@ def registration_of(aligned: Aligned, T_target_source: Float64, C: Float64) -> R
     C
         (6, 6) covariance of the right perturbation, m and rad.
     """
-    directions = aligned.unobservable * UNITS
-    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     return Registration(
         T_target_source=T_target_source,
         converged=aligned.converged,
@@ -232,7 +231,7 @@ def registration_of(aligned: Aligned, T_target_source: Float64, C: Float64) -> R
         error=aligned.scale,
         rms_m=aligned.rms_m,
         information=np.asarray(np.linalg.inv(C), np.float64),
-        unobservable=directions / np.maximum(lengths, 1e-12),
+        unobservable=unit_vectors(aligned.unobservable * UNITS),
     )
 
 

@@ -87,8 +87,7 @@ class JoinChecks:
         ]
         options = projective.ProjectiveOptions(levels=verification.PATIENT)
         contradictions = []
-        for k in evenly_spaced(np.arange(len(pairs)), _MAX_LEARNT_PAIRS):
-            a, b = pairs[k]
+        for a, b in evenly_spaced(pairs, _MAX_LEARNT_PAIRS):
             T_a_b = se3.inverse(a.T_component_camera) @ b.T_component_camera
             aligned = projective.align(b.view, [projective.Target(a.view)], T_a_b, options)
             if aligned.overlap >= _OVERLAP:

@@ -20,7 +20,7 @@ import numpy as np
 from tofuse.engine.alignment import covariance, projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import one_blas_thread, run_all
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, unit_vectors
 from tofuse.engine.loops.join_checks import JoinChecks
 from tofuse.engine.loops.merged_components import DRIFT, MergedComponents, TrackedComponent, View
 from tofuse.engine.search import (
@@ -104,7 +104,7 @@ class Location:
         shift, angle = se3.lengths(T_view_other) * DRIFT
         sigma = np.repeat([shift + angle * depth, angle + shift / depth], 3)
         rival = self.runner_up
-        free = free / np.maximum(np.linalg.norm(free, axis=1, keepdims=True), 1e-12)
+        free = unit_vectors(free)
         drifted = "tracking from the nearest located frame does not constrain all directions"
         return replace(
             self,
@@ -463,7 +463,7 @@ class Locator:
         return Location(
             placed.T_map_camera,
             C,
-            directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12),
+            unit_vectors(directions),
             probability,
             "; ".join(reasons),
             None if rival is None else rival.T_map_clip @ view.T_component_camera,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, unit_vectors
 from tofuse.engine.icp import icp_kernels, interfaces, surface_metrics
 from tofuse.engine.parts import part
 
@@ -53,8 +53,7 @@ class Symmetric(surface_metrics.SurfaceMetric):
 
     def fit(self, pairs: surface_metrics.SurfacePairs) -> tuple[Float64, float]:
         """See `SurfaceMetric.fit`: along the mean normal."""
-        n = pairs.source_normals + pairs.target_normals
-        n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
+        n = unit_vectors(pairs.source_normals + pairs.target_normals)
         r = (pairs.residual * n).sum(1)
         weight = pairs.weight * surface_metrics.loss_weights(self.loss, r, pairs.resolution)
         H, _, square = icp_kernels.plane_sums(pairs.points, n, n, r, weight)

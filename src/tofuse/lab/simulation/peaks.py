@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.frames import CloudFrame
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, unit_vectors
 
 CAMERAS = 20
 RADIUS_M = 10.0
@@ -43,8 +43,7 @@ def peaks_normals() -> Float64:
     step = 1e-5
     slope_x = (peaks(x + step, y) - peaks(x - step, y)) / (2 * step)
     slope_y = (peaks(x, y + step) - peaks(x, y - step)) / (2 * step)
-    normals = np.stack([-slope_x, np.ones_like(x), -slope_y], -1)
-    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return unit_vectors(np.stack([-slope_x, np.ones_like(x), -slope_y], -1))
 
 
 def peaks_cameras() -> Float64:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64, Int64
-from tofuse.engine.geometry import se3, triangles
+from tofuse.engine.geometry import se3, triangles, unit_vectors
 
 # Crease angle: edges below it are smoothed.
 CREASE_RAD = np.deg2rad(48.0)
@@ -73,9 +73,7 @@ def joined(meshes: Sequence[Mesh]) -> Mesh:
 
 def face_normals(mesh: Mesh) -> Float64:
     """(F, 3) unit normals; zero for a triangle without area."""
-    n = triangles.crosses(mesh.corners())
-    length = np.linalg.norm(n, axis=1, keepdims=True)
-    return n / np.where(length > 0, length, 1.0)
+    return unit_vectors(triangles.crosses(mesh.corners()))
 
 
 def corner_normals(mesh: Mesh, crease_rad: float = CREASE_RAD) -> Float64:
@@ -101,7 +99,7 @@ def corner_normals(mesh: Mesh, crease_rad: float = CREASE_RAD) -> Float64:
     np.add.at(total, corner, weight[:, None] * normals[other])
     length = np.linalg.norm(total, axis=1, keepdims=True)
     face_normal = np.repeat(normals, 3, axis=0)
-    out = np.where(length > 1e-12, total / np.where(length > 0, length, 1.0), face_normal)
+    out = np.where(length > 1e-12, unit_vectors(total), face_normal)
     return out.reshape(-1, 3, 3)
 
 
