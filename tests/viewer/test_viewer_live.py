@@ -9,7 +9,7 @@ from time import sleep
 import numpy as np
 import pytest
 
-from browser import changed, chromium, watched
+from browser import changed, watched
 from tofuse.apps.jobs.run_options import Options
 from tofuse.apps.jobs.running import run
 from tofuse.apps.viewer.server import serve, stop
@@ -19,12 +19,6 @@ needs_viser = pytest.mark.skipif(
     importlib.util.find_spec("viser") is None, reason="viser is not installed"
 )
 CANVAS = "canvas[data-engine]"
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
 
 
 def drawn(seen):
