@@ -91,7 +91,7 @@ def test_live_map_places_the_frames_of_a_camera(room_recording):
 
 @pytest.mark.nightly
 @needs_viser
-def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, browser, monkeypatch):
+def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, browser):
     from tofuse.apps.viewer.live_view import LiveView
     from tofuse.apps.viewer.server import address
     from tofuse.engine.progress import CombinedProgress
