@@ -183,14 +183,14 @@ def leaf(length: float, width: float, droop: float) -> Mesh:
     return meshes.grid(points)
 
 
-def plant(assembly: Assembly, rng: np.random.Generator, leaves: int = 34) -> None:
+def plant(assembly: Assembly, rng: np.random.Generator) -> None:
     """Add a potted plastic plant, 1.1 m high: stems that fan out, with broad leaves."""
     pot = [(0, 0), (0.12, 0), (0.165, 0.27), (0.175, 0.27), (0.175, 0.30), (0.155, 0.30)]
     assembly.add(POT, meshes.lathe([*pot, (0.15, 0.26)], 28))
     assembly.add(SOIL, meshes.lathe([(0.152, 0.262), (0, 0.275)], 20))
     stems: list[Mesh] = []
     foliage: list[Mesh] = []
-    golden = np.pi * (3 - np.sqrt(5))
+    golden, leaves = np.pi * (3 - np.sqrt(5)), 34
     for k in range(leaves):
         fraction = (k + 0.5) / leaves
         azimuth = golden * k + rng.uniform(-0.3, 0.3)
