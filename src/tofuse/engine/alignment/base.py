@@ -251,8 +251,8 @@ class Registrar(Protocol):
 
     @property
     def takes(self) -> frozenset[str]:
-        """Kinds of view it works on: "range", "cloud"."""
-        ...
+        """Kinds of view it works on: "range", "cloud"; by default both."""
+        return frozenset({"range", "cloud"})
 
     def register(
         self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator

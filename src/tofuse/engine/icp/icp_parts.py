@@ -8,7 +8,7 @@ the iterations. Metrics with normals are in `surface_metrics`, rarer parts in th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -88,8 +88,6 @@ class Uniform(Bounded, interfaces.Selector):
 @dataclass(frozen=True)
 class ClosestPoint(interfaces.Matcher):
     """The closest point of the target (Besl and McKay 1992), by a kd-tree (section 2.9.5)."""
-
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def prepare(self, target: interfaces.Points) -> interfaces.Search:
         """Build the tree, once for all iterations: the target doesn't move.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -64,8 +64,6 @@ class Multipath(Bounded, Correction):
     trial: bool = True
     applied: bool = True
     strength: tuple[float, ...] | None = None
-
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
         super().__post_init__()

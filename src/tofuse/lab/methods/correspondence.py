@@ -40,7 +40,6 @@ class NormalShooting(Bounded, interfaces.Matcher):
     """
 
     steps: Annotated[int, Bounds(1)] = 3
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def prepare(self, target: interfaces.Points) -> interfaces.Search:
         """Build the tree, once for all iterations."""
@@ -158,7 +157,6 @@ class ClosestCompatible(Bounded, interfaces.Matcher):
     """
 
     ratio: Annotated[float, Bounds(1, exclusive=True)] = 1.2
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def prepare(self, target: interfaces.Points) -> interfaces.Search:
         """Build the tree, once for all iterations."""
@@ -212,7 +210,6 @@ class ClosestInvariant(Bounded, interfaces.Matcher):
     features: Annotated[tuple[Invariant, ...], NotEmpty()] = ("moments",)
     weight: Annotated[float, Bounds(0, exclusive=True)] = 20.0
     radius: Annotated[float, Bounds(0, exclusive=True)] = 6.0
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def prepare(self, target: interfaces.Points) -> interfaces.Search:
         """Build the tree, once for all iterations."""

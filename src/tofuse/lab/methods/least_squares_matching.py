@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -94,7 +94,6 @@ class LeastSquaresMatching(Bounded, Registrar):
     scale_sigma: Annotated[float, Bounds(0)] = 0.0
     intensity: Annotated[float, Bounds(0)] = 0.0
     max_iterations: Annotated[int, Bounds(1)] = 50
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def register(
         self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
