@@ -170,7 +170,7 @@ def shared_weights(matches: Matches, alignment: Alignment) -> Float64:
 def in_scales(residual: Float64, resolution: float) -> Float64:
     """Return absolute residuals (m,), in m, relative to their robust scale.
 
-    The scale is 1.4826 times their median, at least a thousandth of the resolution.
+    The scale is their `robust_sigma`, at least a thousandth of the resolution.
     """
     magnitude = np.abs(residual)
     return np.asarray(magnitude / max(robust_sigma(magnitude), _MIN_SIGMA_RATIO * resolution))
