@@ -33,7 +33,7 @@ from tofuse.engine.compute import run_all
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import RangeFrame, Recording, evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.trajectory_errors import associate, finite_or_none
+from tofuse.engine.quality.trajectory_errors import finite_or_none
 from tofuse.engine.quality.view_agreement_kernels import (
     agreement_sums,
     transform_points,
@@ -267,8 +267,7 @@ def map_consistency(
     recording
         Range images.
     poses
-        (M, 4, 4) T_world_camera of the M frames of the recording, NaN where there is none; see
-        `poses_of_frames` for a trajectory with its own times.
+        (M, 4, 4) T_world_camera of the M frames of the recording, NaN where there is none.
     frames
         Maximum number of frames to use.
     correctors
@@ -308,26 +307,6 @@ def map_consistency(
         images.append(SurfaceImage.of(frame, depth_unit_m))
         used.append(int(k))
     return consistency_of_images(images, T[used])
-
-
-def poses_of_frames(times: ArrayLike, pose_times: ArrayLike, poses: ArrayLike) -> Float64:
-    """Assign each pose to the frame nearest in time, if that is within 0.02 s.
-
-    Parameters
-    ----------
-    times
-        (M,) times of the frames, s.
-    pose_times, poses
-        (P,) s and (P, 4, 4).
-
-    Returns
-    -------
-    (M, 4, 4), NaN for frames without a pose.
-    """
-    frame_poses = np.full((np.size(times), 4, 4), np.nan)
-    frames, rows = associate(times, pose_times).T
-    frame_poses[frames] = np.asarray(poses, float)[rows]
-    return frame_poses
 
 
 def _compare(a: SurfaceImage, b: SurfaceImage, T_a_b: Float64) -> tuple[int, int, int, float]:
