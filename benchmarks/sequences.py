@@ -24,8 +24,7 @@ from tofuse.engine.frames.frames import Frame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.adaptation import with_recording_defaults
 from tofuse.engine.mapping.methods import default
-from tofuse.engine.quality.map_agreement import poses_of_frames
-from tofuse.formats.poses.trajectory import read_tum
+from tofuse.formats.poses.trajectory import associated_poses, read_tum
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.methods.filters_foreground import Foreground
 from tofuse.lab.simulation.record import PlanOptions, simulate
@@ -134,7 +133,7 @@ def kinect_loop(data: Path) -> Recording:
     """Stop-and-go views, with the poses of the robot that carried the camera."""
     recording = recorded("kinectv2_loop", "recording")(data)
     times, poses = read_tum(Path(recording.path) / "reference_poses.txt")
-    recording.source.reference = poses_of_frames(recording.timestamps, times, poses)
+    recording.source.reference = associated_poses(recording.timestamps, times, poses)
     return recording
 
 

@@ -237,7 +237,7 @@ def test_shift_is_decided_by_the_median() -> None:
     np.testing.assert_allclose(moved.points + moved.shift, points[300:] + MAP, atol=1e-3)
 
 
-def test_depth_in_map_coordinates_needs_sensor(tmp_path, pose, capsys) -> None:
+def test_depth_in_map_coordinates_needs_sensor(tmp_path, capsys) -> None:
     """Points are not measured from the origin of a map."""
     for k, points in enumerate((SOURCE, TARGET)):
         write(tmp_path / "in" / f"{k}.xyz", points + MAP)

@@ -271,7 +271,7 @@ def test_container_quotas_limit_cores(name, tmp_path, monkeypatch) -> None:
     assert cores.usable_cores.__wrapped__() == expected
 
 
-def test_second_run_into_same_folder_is_rejected(clouds: Path, tmp_path: Path, capfd) -> None:
+def test_second_run_into_same_folder_is_rejected(tmp_path: Path, capfd) -> None:
     from tofuse.apps.results.folders import OutputFolder
 
     with OutputFolder(tmp_path / "out"):

@@ -53,7 +53,7 @@ def test_words_become_options(words: str, changed: dict[str, Any]) -> None:
     assert options_of(*words.split()) == Options(out=Path("out"), **changed)
 
 
-def test_options_become_configuration(tmp_path: Path) -> None:
+def test_options_become_configuration() -> None:
     assert config_of("--guess", "identity")["odometry"]["guess"] == "identity"
     assert config_of("--moving", "ignore")["odometry"]["moving"] == "ignore"
     assert config_of("--tolerance", "5mm")["tolerance_m"] == 0.005

@@ -8,16 +8,10 @@ import pytest
 import tofuse
 from pose_errors import pose_error
 from registration_scenes import rng, turn
-from searched_pair import TRUE, A, B, seen
+from searched_pair import TRUE, clouds
 from tofuse.engine.clouds.fpfh import fpfh, mutually_nearest
 from tofuse.engine.geometry import se3
 from tofuse.formats.geometry.ply import read_ply
-
-
-@pytest.fixture(scope="module")
-def corners():
-    """Points of a furnished corner from two places half a metre and 30 degrees apart."""
-    return seen(B, seed=1).points.astype(float), seen(A, seed=2).points.astype(float)
 
 
 def test_real_pair_of_lidar_scans_upside_down(shared_data):
@@ -33,8 +27,8 @@ def test_real_pair_of_lidar_scans_upside_down(shared_data):
 
 
 @pytest.mark.nightly
-def test_wrong_start_is_left_without_guess(corners):
-    source, target = corners
+def test_wrong_start_is_left_without_guess():
+    source, target = clouds()
     turned = turn([0.2, 1, 0.3], 150, centre=np.median(source, 0) + 5)
     moved = se3.transform(se3.inverse(turned), source)
     found = tofuse.register(moved, target)

@@ -24,7 +24,7 @@ def test_listed_kernels_exist() -> None:
     assert len(listed) == len(set(listed)) > len(ahead.signatures()) > 50
 
 
-def test_listed_signatures_compile(tmp_path: Path) -> None:
+def test_listed_signatures_compile() -> None:
     """From the cache of these tests, or compiled now: unsupported types would fail."""
     words = [sys.executable, "-m", "tofuse.engine.compute.ahead"]
     subprocess.run(words, check=True, capture_output=True)

@@ -104,7 +104,7 @@ def test_without_folder_nothing_is_kept() -> None:
     assert not was_loaded(compiled)
 
 
-def test_shipped_kernel_is_loaded_though_own_can_be_kept(tmp_path, monkeypatch) -> None:
+def test_shipped_kernel_is_loaded_though_own_can_be_kept(tmp_path) -> None:
     shipped, own = tmp_path / "shipped", tmp_path / "own"
     shipped.mkdir()
     own.mkdir()

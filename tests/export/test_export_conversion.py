@@ -137,7 +137,7 @@ def test_convert_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert not (tmp_path / "new").exists()
 
 
-def test_failed_conversion_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_conversion_leaves_nothing(tmp_path: Path) -> None:
     made_arrays.make_npz(tmp_path / "a.npz")
     recording = open_recording(tmp_path / "a.npz")
 

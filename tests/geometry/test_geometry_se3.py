@@ -79,6 +79,8 @@ def test_log_and_angle_are_exact_near_pi(axis: np.ndarray) -> None:
 def test_motions_are_compared_by_length_and_angle() -> None:
     T = se3.exp(np.array([[0.3, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0.2, 0]]))
     np.testing.assert_allclose(se3.lengths(T), [[0.3, 0], [0, 0.2]], atol=1e-12)
+    np.testing.assert_allclose(se3.change_of_view(T, [1.5, 9.0]), [0.2, 0.2], atol=1e-12)
+    assert se3.change_of_view(T[0], 3.0) == pytest.approx(0.1)
     assert se3.is_within(T[0], 0.31, 0.0)
     assert not se3.is_within(T[0], 0.29, 0.1)
     assert se3.is_within(T[1], 0.0, 0.21)

@@ -15,7 +15,7 @@ EYE = np.eye(4)
 CAMERA = BrownConrady(88, 72, 90.0, 90.0, 43.0, 36.0, -0.2, 0.05)
 
 
-def look(position, target, camera=CAMERA):
+def look(position, target):
     """Pose (4, 4) of a camera at `position` that looks at `target`, image rows along y."""
     z = np.asarray(target, float) - position
     z /= np.linalg.norm(z)

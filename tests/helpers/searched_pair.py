@@ -47,3 +47,8 @@ A, B = camera(-0.2, 0.0, 0.0), camera(0.55, 0.2, -0.5)
 
 
 TRUE = se3.inverse(A) @ B
+
+
+def clouds():
+    """Points of the room from these two places, source and target."""
+    return seen(B, seed=1).points.astype(float), seen(A, seed=2).points.astype(float)

@@ -23,6 +23,7 @@ from tofuse.engine.icp.surface_metrics import (
     loss_weights,
     surface_pairs,
 )
+from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.lab.methods.symmetric import Symmetric
 
 SURFACE_METRICS = [PointToPlane(), Symmetric(), PlaneToPlane()]
@@ -140,7 +141,7 @@ def test_robust_losses_tolerate_gross_errors(metric):
 
 def test_losses_match_formulas():
     r = np.array([0, 1, 2, 5, 20.0, -1, -2]) * 0.01
-    sigma = 1.4826 * 0.02
+    sigma = 0.02 / MEDIAN_OF_NORMAL
     x = np.abs(r) / sigma
     np.testing.assert_allclose(loss_weights("square", r, 1e-3), 1)
     huber = np.where(x <= 1.345, 1, 1.345 / np.maximum(x, 1e-9))

@@ -8,20 +8,14 @@ import pytest
 import tofuse
 from pose_errors import pose_error
 from registration_scenes import rng, stone, turn
-from searched_pair import TRUE, A, B, seen
+from searched_pair import TRUE, clouds
 from tofuse.engine.geometry import se3
 from tofuse.lab.methods.fpfh import Fpfh
 
 
-@pytest.fixture(scope="module")
-def corners():
-    """Points of a furnished corner from two places half a metre and 30 degrees apart."""
-    return seen(B, seed=1).points.astype(float), seen(A, seed=2).points.astype(float)
-
-
 @pytest.mark.parametrize("degrees", [30, 75, 120, 180])
-def test_partially_overlapping_views_under_any_rotation(corners, degrees):
-    source, target = corners
+def test_partially_overlapping_views_under_any_rotation(degrees):
+    source, target = clouds()
     turned = turn(rng(degrees).normal(size=3), degrees, centre=np.median(source, 0))
     strange = rng(7).uniform(source.min(0), source.max(0), (len(source) // 10, 3))
     moved = se3.transform(se3.inverse(turned), np.vstack([source, strange]))

@@ -135,7 +135,7 @@ def test_component_of_another_scene_does_not_separate_others(three, elsewhere) -
     assert_joined(groups[0], parts, path)
 
 
-def test_largest_group_comes_first(elsewhere, three) -> None:
+def test_largest_group_comes_first(three) -> None:
     strange = stretch(0, range(4), **STRANGE)
     groups = SPARSELY.join([strange, three[1], three[2]], [])
     assert members(groups) == [[1, 2], [0]]
@@ -397,7 +397,7 @@ def test_independent_links_raise_probability(three, min_probability) -> None:
     assert other > same
 
 
-def test_first_group_is_main_on_request(elsewhere, three) -> None:
+def test_first_group_is_main_on_request(three) -> None:
     strange = stretch(0, range(4), **STRANGE)
     groups = replace(SPARSELY, main="first").join([strange, three[1], three[2]], [])
     assert members(groups) == [[0], [1, 2]]

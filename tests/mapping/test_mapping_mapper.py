@@ -312,7 +312,7 @@ def test_temporal_filters_see_raw_neighbours_of_selected_frames(recording, frame
     assert [f.index for f in result.diagnostics.frames] == [0, 3, 6]
 
 
-def test_unreadable_neighbours_are_left_out(recording, room_recording, tmp_path) -> None:
+def test_unreadable_neighbours_are_left_out(room_recording, tmp_path) -> None:
     copy = shutil.copytree(room_recording, tmp_path / "copy")
     (copy / "depth" / "000002.png").write_bytes(b"no image")
     SeesHistory.seen.clear()

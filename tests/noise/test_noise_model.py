@@ -21,7 +21,6 @@ from tofuse.engine.noise.model import (
     ConfidenceLaw,
     NoiseModel,
     RangeLaw,
-    incidence_cosine,
 )
 from tofuse.formats.cameras.calibration_files import read_noise, write_noise
 
@@ -102,15 +101,14 @@ def test_precedence_of_laws() -> None:
     assert model.law(frame()) == "range"
 
 
-def test_invalid_pixels_have_no_sigma_and_z_less_than_range() -> None:
+def test_invalid_pixels_have_no_sigma() -> None:
     depth = image(2.0)
     depth[3, 4] = 0
     seen = frame(depth)
-    sigma, z = DARK.sigma(seen), DARK.sigma_z(seen)
+    sigma = DARK.sigma(seen)
     assert sigma.dtype == np.float32
-    assert sigma[3, 4] == z[3, 4] == 0
+    assert sigma[3, 4] == 0
     assert (sigma > 0).sum() == sigma.size - 1
-    np.testing.assert_allclose(z[0, 0] * ray_lengths(CAMERA)[0, 0], sigma[0, 0], rtol=1e-6)
 
 
 def test_z_images_have_noise_of_their_range() -> None:
@@ -128,17 +126,15 @@ def test_tilted_wall_is_noisier_by_change_within_pixel() -> None:
     z[z < 0] = 0
     normals = np.broadcast_to(normal.astype(np.float32), (30, 40, 3))
     seen = RangeFrame(0, 0.0, CAMERA, z, "z", normal_image=normals)
-    cosine = incidence_cosine(seen)
-    assert cosine is not None
     model = NoiseModel("flat", RangeLaw(1e-6, 0.0), footprint=0.29)
     sigma = model.sigma(seen)[15, 15:25]
     distance = np.linalg.norm(seen.point_image[15], axis=-1)
     change = np.abs(np.gradient(distance))[15:25]
     # The step to the neighbour is perpendicular to the ray: within the obliqueness of these rays.
     np.testing.assert_allclose(sigma, 0.29 * change, rtol=0.12)
-    assert (model.sigma(seen, np.ones((30, 40), np.float32)) < 1e-5).all()
-    unknown = np.full((30, 40), np.nan, np.float32)
-    assert (model.sigma(seen, unknown) < 1e-5).all()
+    unknown = np.full_like(normals, np.nan)
+    assert (model.sigma(replace(seen, normal_image=unknown)) < 1e-5).all()
+    assert (model.sigma(replace(seen, normal_image=None)) < 1e-5).all()
 
 
 def test_json_round_trip(tmp_path: Path) -> None:

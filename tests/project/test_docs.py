@@ -147,13 +147,30 @@ def test_links_are_valid(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_files_named_in_documents_exist(name: str) -> None:
-    """Paths in backticks that look like this project's own files."""
+    """Paths in backticks that look like this project's own files, and names of Python files."""
     bases = [ROOT, ROOT / "src" / "tofuse"]
     rooms = {p.name for p in bases[1].iterdir() if p.is_dir()} | {"benchmarks", "tests", "docs"}
     for code in codes(text_of(name)):
         path = code.removeprefix("src/tofuse/")
         if path.split("/")[0] in rooms and re.fullmatch(r"[\w./]+\.(py|md)", path):
             assert any((base / path).exists() for base in bases), f"{name} names {code}"
+        elif re.fullmatch(r"\w+\.py", code):
+            folders = (ROOT / folder for folder in ("src", "benchmarks", "tests", "website"))
+            found = (ROOT / code).exists() or any(any(f.rglob(code)) for f in folders)
+            assert found, f"{name} names {code}"
+
+
+def test_modules_named_in_sources_exist() -> None:
+    """Names `room.module` in docstrings and comments: no module has moved since."""
+    package = ROOT / "src" / "tofuse"
+    rooms: dict[str, set[str]] = {}
+    for path in package.rglob("*"):
+        rooms.setdefault(path.stem, set()).add(path.parent.name)
+    for path in package.rglob("*.py"):
+        for room, module in re.findall(r"`([a-z_]+)\.(\w+)[.\w]*`", path.read_text("utf-8")):
+            is_file = module in {"html", "js", "ply", "glb", "usdz"}
+            if module in rooms and not is_file and room not in {"tofuse", "platform"}:
+                assert room in rooms[module], f"{path} names {room}.{module}"
 
 
 def test_every_benchmark_is_listed() -> None:

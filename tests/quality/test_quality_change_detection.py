@@ -57,7 +57,7 @@ def test_moved_box_appears_and_vanishes(earlier) -> None:
 
 
 @pytest.mark.parametrize("kind", ["appeared", "vanished"])
-def test_added_or_removed_box_is_detected(earlier, kind) -> None:
+def test_added_or_removed_box_is_detected(kind) -> None:
     rest = BOXES[:CHAIR] + BOXES[CHAIR + 1 :]
     first, second = views(FIRST, 0), views(BESIDE, 100, boxes=rest)
     if kind == "vanished":

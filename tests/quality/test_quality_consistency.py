@@ -26,9 +26,8 @@ from tofuse.engine.quality.map_agreement import (
     SurfaceImage,
     consistency_of_images,
     map_consistency,
-    poses_of_frames,
 )
-from tofuse.formats.poses.trajectory import write_tum
+from tofuse.formats.poses.trajectory import associated_poses, write_tum
 from tofuse.formats.readers.native import NativeSource
 from written_run_json import write_run
 
@@ -245,11 +244,12 @@ def test_frames_are_sampled_evenly() -> None:
     assert evenly_spaced(np.arange(101), 5).tolist() == [0, 25, 50, 75, 100]
     assert evenly_spaced(np.array([3, 8, 9]), 2).tolist() == [3, 9]
     assert evenly_spaced(np.arange(0), 5).tolist() == []
+    assert evenly_spaced("abcde", 3) == ["a", "c", "e"]
 
 
 def test_poses_are_assigned_to_nearest_frame() -> None:
     T = path(4)
-    out = poses_of_frames([0.0, 0.1, 0.2], [0.09, 0.105, 0.219, 0.35], T)
+    out = associated_poses([0.0, 0.1, 0.2], [0.09, 0.105, 0.219, 0.35], T)
     assert np.isnan(out[0]).all()
     assert np.array_equal(out[1], T[1])  # the last of two poses for it
     assert np.array_equal(out[2], T[2])
@@ -306,7 +306,7 @@ def ours(recording: Path, trajectory: Path, frames: int) -> Consistency:
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = quaternion.to_matrix(rows[:, 4:8])
     poses[:, :3, 3] = rows[:, 1:4]
-    return map_consistency(opened, poses_of_frames(opened.timestamps, rows[:, 0], poses), frames)
+    return map_consistency(opened, associated_poses(opened.timestamps, rows[:, 0], poses), frames)
 
 
 @pytest.mark.nightly

@@ -87,7 +87,7 @@ def test_samples_of_zero_leave_gravity_unknown(tmp_path: Path):
     assert warning.endswith("imu.csv: has no samples other than zero near the time of any frame")
 
 
-def test_simulated_accelerometer_gives_camera_tilt(tmp_path: Path):
+def test_simulated_accelerometer_gives_camera_tilt():
     from tofuse.lab.simulation.accelerometer import accelerations
     from tofuse.lab.simulation.record import plan
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from browser import changed, chromium, watched
+from browser import changed, watched
 from report_results import make_room
 from tofuse.apps.certainty import LengthErrors
 from tofuse.apps.report.html import asset
@@ -29,12 +29,6 @@ def report(tmp_path_factory):
     result, extras = make_room()
     write_report(result, path, extras)
     return path
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
 
 
 @contextmanager

@@ -176,7 +176,7 @@ def test_current_folder_is_not_replaced(tmp_path, monkeypatch, where) -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX permissions")
 @pytest.mark.parametrize("read_only", ["out", "its parent"])
-def test_read_only_folder_is_refused(tmp_path, monkeypatch, read_only) -> None:
+def test_read_only_folder_is_refused(tmp_path, read_only) -> None:
     out = tmp_path / "parent/out"
     out.mkdir(parents=True)
     folder = out if read_only == "out" else out.parent

@@ -349,18 +349,6 @@ def pair(seed=3):
     return camera, views[1], views[0], T
 
 
-SCALE, MODEL_ERROR, JUMP, RADIUS, MOST, LEAST, WEIGHT, STRIDE = (
-    1.3,
-    0.004,
-    0.04,
-    1,
-    3.0,
-    1.2,
-    0.3,
-    2,
-)
-
-
 def test_person_before_static_camera_is_segmented(shared_data):
     frames = list(open_recording(shared_data / "person_turning"))[:40:4]
     views = [prepare_view(frame, SurfaceOptions()) for frame in frames]

@@ -9,7 +9,7 @@ from time import sleep
 import numpy as np
 import pytest
 
-from browser import changed, chromium, watched
+from browser import changed, watched
 from tofuse.apps.jobs.run_options import Options
 from tofuse.apps.jobs.running import run
 from tofuse.apps.viewer.server import serve, stop
@@ -19,12 +19,6 @@ needs_viser = pytest.mark.skipif(
     importlib.util.find_spec("viser") is None, reason="viser is not installed"
 )
 CANVAS = "canvas[data-engine]"
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
 
 
 def drawn(seen):
@@ -97,7 +91,7 @@ def test_live_map_places_the_frames_of_a_camera(room_recording):
 
 @pytest.mark.nightly
 @needs_viser
-def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, browser, monkeypatch):
+def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, browser):
     from tofuse.apps.viewer.live_view import LiveView
     from tofuse.apps.viewer.server import address
     from tofuse.engine.progress import CombinedProgress

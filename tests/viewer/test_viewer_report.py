@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
-from browser import chromium, watched
+from browser import watched
 from report_results import circle, make_room, view
 from tofuse.apps.cli.program import main
 from tofuse.apps.report.sections import write_report
@@ -179,12 +179,6 @@ def test_failures_are_reported_in_one_line(made, tmp_path, what, capsys) -> None
         assert main(["view", str(out), "--no-open", *options]) == 2
     expected = f"--port {options[1]}" if options else str(out)
     assert re.fullmatch(f"tofuse: .*{re.escape(expected)}.*\n", capsys.readouterr().err)
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
 
 
 def opened(browser, server):

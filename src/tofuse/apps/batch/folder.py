@@ -12,7 +12,7 @@ from tofuse.apps.batch.jobs import Job
 from tofuse.engine.errors import OutputError
 from tofuse.formats.files import atomic
 
-_UNFINISHED = ".tofuse-"  # files of a run that is in progress or was killed; `results.folder`
+_UNFINISHED = ".tofuse-"  # files of a run that is in progress or was killed; `results.folders`
 
 _TEXT_FIELDS = ("key", "state", "host", "run", "verdict", "reason")
 

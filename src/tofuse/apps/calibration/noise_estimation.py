@@ -24,7 +24,7 @@ from tofuse.engine.noise import (
     RangeLaw,
     noise_model_for,
 )
-from tofuse.engine.normal import MEDIAN_OF_NORMAL
+from tofuse.engine.normal import robust_sigma
 from tofuse.formats.recordings import still
 
 MIN_FRAMES = 3
@@ -293,7 +293,7 @@ def _nonnegative_fit(columns: Float64, target: Float64, pixels: Float64) -> Floa
         w = base * np.sqrt(weights) / target
         x = nnls(columns / scale * w[:, None], target * w)[0] / scale
         errors = np.abs(np.log(np.maximum(columns @ x, 1e-30) / target))
-        limit = 1.5 * max(float(np.median(errors)) / MEDIAN_OF_NORMAL, 1e-3)
+        limit = 1.5 * max(robust_sigma(errors), 1e-3)
         weights = limit / np.maximum(errors, limit)
     return x
 

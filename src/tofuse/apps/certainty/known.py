@@ -85,12 +85,12 @@ class Known:
         views = [v for v in known.views if v.index in steady]
         if len(views) < 2:
             return None
-        chosen = evenly_spaced(np.arange(len(views)), _KEYFRAMES - 1)
-        positions = np.array([row[views[k].index] for k in chosen], np.intp)
+        chosen = evenly_spaced(views, _KEYFRAMES - 1)
+        positions = np.array([row[v.index] for v in chosen], np.intp)
         centre = graph.poses[positions, :3, 3].mean(0)
         graph = graph.with_poses(_about(centre, graph.poses))
-        surfaces = Surfaces.of_views([views[k] for k in chosen], graph.poses[positions])
-        sampled = _measured_pairs([views[k] for k in chosen], graph.poses[positions])
+        surfaces = Surfaces.of_views(chosen, graph.poses[positions])
+        sampled = _measured_pairs(chosen, graph.poses[positions])
         each = len(views) / len(chosen)
         is_open = np.isin(graph.ids, [*known.degenerate])
         ends = is_open[graph.edges]
@@ -116,7 +116,7 @@ class Known:
         core = np.flatnonzero(degree > 1)
         if len(core) < 2 or normals is None or not len(normals):
             return None
-        positions = core[evenly_spaced(np.arange(len(core)), _KEYFRAMES - 1)]
+        positions = evenly_spaced(core, _KEYFRAMES - 1)
         centre = graph.poses[positions, :3, 3].mean(0)
         graph = graph.with_poses(_about(centre, graph.poses))
         surfaces = Surfaces.of_points(
@@ -127,7 +127,7 @@ class Known:
         times = np.array([time[i] for i in graph.ids.tolist()])
         each = len(core) / len(positions)
         among = np.flatnonzero((degree[graph.edges] > 1).all(1))
-        edges = among[evenly_spaced(np.arange(len(among)), _PAIRS_SAMPLED)]
+        edges = evenly_spaced(among, _PAIRS_SAMPLED)
         i, j = graph.edges[edges].T
         sampled = _Pairs(
             graph.poses[i],

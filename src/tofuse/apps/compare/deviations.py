@@ -15,12 +15,12 @@ import numpy as np
 from scipy.stats import norm
 
 from tofuse.apps.compare.nearest import Distances, Reach, Reference
-from tofuse.apps.compare.surface import Surface, spacing_of, unit_vectors
+from tofuse.apps.compare.surface import Surface, spacing_of
 from tofuse.apps.compare.unmatched import FEWEST, Unmatched, unmatched
 from tofuse.apps.report import scene
 from tofuse.engine.arrays import Bool, Float64, Intp
-from tofuse.engine.geometry import KdTree, se3
-from tofuse.engine.normal import SIGMA_OF_MEDIAN, robust_sigma
+from tofuse.engine.geometry import KdTree, se3, unit_vectors
+from tofuse.engine.normal import robust_sigma
 
 # Points of the fit, first of a sample, and of the map; and iterations.
 _FIT_POINTS, _MAX_POINTS, _ITERATIONS = (4000, 100_000), 250_000, (30, 3)
@@ -200,7 +200,7 @@ def _iterated(
         if used.sum() < FEWEST:
             return T, 6
         r = found.signed[used]
-        scale = SIGMA_OF_MEDIAN * np.median(np.abs(r - np.median(r)))
+        scale = robust_sigma(r - np.median(r))
         cut = max(_CUT_TOLERANCES * (tolerance_m or 0.0), _CUT_SIGMAS * scale)
         near = np.abs(r) <= max(cut, float(np.median(np.abs(r))))
         centre = moved[used].mean(0)
@@ -409,8 +409,7 @@ def _point_noise(
     correlation = ((1 + rho) / (1 - rho)) ** 2  # along both directions of a surface
     if stated is None:
         return np.full(len(feet), spread), 1.0, correlation
-    ratio = np.abs(e) / np.maximum(stated[rows][sampled], 1e-9)
-    scale = max(SIGMA_OF_MEDIAN * float(np.median(ratio)), 1.0)
+    scale = max(robust_sigma(e / np.maximum(stated[rows][sampled], 1e-9)), 1.0)
     return scale * stated[rows], scale, correlation
 
 

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tofuse.apps.compare.surface import Surface, spacing_of, unit_vectors
+from tofuse.apps.compare.surface import Surface, spacing_of
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.errors import InputError
-from tofuse.engine.geometry import KdTree
+from tofuse.engine.geometry import KdTree, unit_vectors
 from tofuse.engine.geometry import triangles as triangle_geometry
 
 # Longest edge of a triangle after its division, as a fraction of the diagonal, and with which there

@@ -14,7 +14,7 @@ from tofuse.engine.arrays import Float64, Int32
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame
 from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh
-from tofuse.engine.geometry import KdTree, triangles
+from tofuse.engine.geometry import KdTree, triangles, unit_vectors
 from tofuse.engine.icp import extent, surface_shape
 from tofuse.engine.normal import OF_95_PERCENT
 from tofuse.engine.results import Reconstruction
@@ -175,11 +175,6 @@ def vertex_normals(points: Float64, faces: Int32) -> Float64:
         axis=1,
     )
     return unit_vectors(normals.astype(np.float64))
-
-
-def unit_vectors(vectors: Float64) -> Float64:
-    """Return vectors (N, 3) of length 1, zeros of zeros."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
 
 
 def in_metres(

@@ -14,10 +14,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from tofuse.apps.compare.nearest import Reference
-from tofuse.apps.compare.surface import unit_vectors
 from tofuse.apps.report import scene
 from tofuse.engine.arrays import Bool, Float64, Intp
-from tofuse.engine.geometry import KdTree
+from tofuse.engine.geometry import KdTree, unit_vectors
 
 # Points of a place.
 FEWEST = 12

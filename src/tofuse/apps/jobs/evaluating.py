@@ -20,7 +20,7 @@ from tofuse.engine.quality import map_agreement, trajectory_errors
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.sensor import CameraErrors, Corrector
 from tofuse.formats.files import reading
-from tofuse.formats.poses import Clock, TimedPoses, read_poses
+from tofuse.formats.poses import Clock, TimedPoses, associated_poses, read_poses
 from tofuse.formats.recordings import open_recording, read_reference
 
 Poses = str | Path | Float64 | Reconstruction
@@ -138,7 +138,7 @@ def evaluate(
     interval = None if reference_error_m is None else error.ate_within(reference_error_m)
     consistency = None
     if recording is not None:
-        frame_poses = map_agreement.poses_of_frames(recording.timestamps, times, poses)
+        frame_poses = associated_poses(recording.timestamps, times, poses)
         consistency = map_agreement.map_consistency(
             recording, frame_poses, correctors=_correctors(estimate, of_estimate, config)
         )

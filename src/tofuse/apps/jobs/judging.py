@@ -172,7 +172,7 @@ def judge(
     recording
         Range images, as of `tofuse.open`.
     trajectory
-        A file of any format of `files.trajectory_formats`, a result or its folder, a recording with
+        A file of any format of `poses.trajectory_formats`, a result or its folder, a recording with
         poses, or (N, 4, 4) T_world_camera of the frames, NaN where there is none. Timed poses are
         assigned to the nearest frames in time, within 20 ms.
     tolerance_m

@@ -192,7 +192,7 @@ class ResultMap:
         not constrain the motion are aligned with the map.
         """
         views = clip.store.views
-        chosen = [views[k] for k in evenly_spaced(np.arange(len(views)), _LOCATED)]
+        chosen = evenly_spaced(views, _LOCATED)
         located = self.locator.locate(chosen)
         depths = {view.index: view.depth for view in chosen}
         accepted = {k: location for k, location in located.items() if location.accepted}

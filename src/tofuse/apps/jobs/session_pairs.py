@@ -44,7 +44,7 @@ class SessionModel:
     def views(self, session: SessionRecord, views: Sequence[View]) -> list[View]:
         """Return evenly spaced views of a session that have a pose in this model."""
         members = [v for v in views if session.has(v.index) and v.index in self.poses]
-        return [members[k] for k in evenly_spaced(np.arange(len(members)), _COMPARED)]
+        return evenly_spaced(members, _COMPARED)
 
     def posed(self, views: Sequence[View]) -> tuple[list[PreparedView], Float64]:
         """Return prepared views and their poses (N, 4, 4)."""

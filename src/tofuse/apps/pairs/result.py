@@ -15,7 +15,7 @@ from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds import NearOrigin
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, unit_vectors
 from tofuse.formats.geometry import write_ply
 from tofuse.formats.recordings import SingleView
 
@@ -101,7 +101,7 @@ class PairResult:
         is_rotation = (
             np.concatenate([rotations, np.zeros(len(basis))])[: len(basis)] > _MAX_ROTATION
         )
-        return _unit(basis[~is_rotation, :3]), _unit(basis[is_rotation, 3:])
+        return unit_vectors(basis[~is_rotation, :3]), unit_vectors(basis[is_rotation, 3:])
 
     def aligned(self) -> Float64:
         """(N, 3) points of the source in the coordinates of the target's file, m."""
@@ -119,10 +119,6 @@ _EVIDENCE = (
     "contradiction", "margin",
 )  # fmt: skip
 _FIT = ("rms_m", "correspondences", "points", "iterations")
-
-
-def _unit(vectors: Float64) -> Float64:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
 
 
 def pair_json(result: PairResult) -> dict[str, Any]:

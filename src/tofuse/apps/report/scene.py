@@ -14,7 +14,7 @@ from tofuse.apps.report.packing import normal_bytes, pack, quantized
 from tofuse.apps.results import QUALITY, viridis
 from tofuse.engine.arrays import Float32, Float64, Int32, Intp, UInt8, UInt16
 from tofuse.engine.fusion import Cloud, Mesh, Textured, drawing
-from tofuse.engine.geometry import se3, triangles
+from tofuse.engine.geometry import se3, triangles, unit_vectors
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.images import jpeg_bytes
 
@@ -345,9 +345,7 @@ def _drawn_surface(
 
 def _cosines(points: Float64, normals: Float32 | Float64, eye: Float64) -> Float64:
     """Return (N,) scalar products of unit vectors from points (N, 3) to the eye with normals."""
-    to_eye = eye - points
-    to_eye /= np.maximum(np.linalg.norm(to_eye, axis=1, keepdims=True), 1e-12)
-    return np.asarray((to_eye * np.nan_to_num(normals)).sum(1), np.float64)
+    return np.asarray((unit_vectors(eye - points) * np.nan_to_num(normals)).sum(1), np.float64)
 
 
 def extreme_points(points: Float64, outer: float = 2.0) -> Float64:

@@ -68,13 +68,13 @@ class CameraMotion:
         )
 
 
-def compare_in_scene(previous: Rig, current: Rig, level: float = LEVEL) -> list[CameraMotion]:
+def compare_in_scene(previous: Rig, current: Rig) -> list[CameraMotion]:
     """Apply `compare` to two calibrations in one scene, where systematic errors recur."""
-    anywhere = compare(previous, current, level)
+    anywhere = compare(previous, current)
     return [
         replace(motion, chance_elsewhere=other.chance)
         for motion, other in zip(
-            compare(_random_only(previous), _random_only(current), level), anywhere, strict=True
+            compare(_random_only(previous), _random_only(current)), anywhere, strict=True
         )
     ]
 

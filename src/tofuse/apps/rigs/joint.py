@@ -39,8 +39,6 @@ _ROUNDS = (
     pair_equations.Round(12, 0.0, 0.0),
 )
 _CONVERGENCE = 0.002
-# As in `ProjectiveOptions`.
-_ROBUST, _MIN_COSINE = 3.5, math.cos(0.7)
 # Minimum fraction of a view's points that project onto surfaces of another one.
 _OVERLAP = 0.04
 # Prior standard deviation of a camera's depth offset. Data sheets specify about a centimetre.
@@ -61,7 +59,7 @@ _CORRELATED_PIXELS = 12.0
 # Correlation length of errors (to 1/e), and size of regions of space with equal errors, as
 # fractions of the depth.
 _REACH, _REGION = 0.31, 0.1
-# As in `registration.uncertainty`; largest sigma of a constrained direction, and the sigma of an
+# As in `alignment.uncertainty`; largest sigma of a constrained direction, and the sigma of an
 # unconstrained one, in units of 1 cm and 1 degree.
 _STEEPNESS, _MAX_SIGMA, _UNCONSTRAINED_SIGMA = 0.3, 3.0, 30.0
 # Standard deviation of the systematic error of a camera's ranges, as a fraction of the range:
@@ -223,7 +221,7 @@ def _residuals(
     r = height - distance + offsets[1] * by_target
     sigma = (m * p).sum(1) * points[:, residual_kernels.SIGMA]
     variance = sigma**2 + pixels[:, residual_kernels.VARIANCE]
-    near = (distance != 0) & (np.abs(r) < limit_m) & ((s * m).sum(1) >= _MIN_COSINE)
+    near = (distance != 0) & (np.abs(r) < limit_m) & ((s * m).sum(1) >= projective.MIN_COSINE)
     parts = (r, variance, p, m, s, (m * rays).sum(1), by_target)
     return _Residuals(*(part[near & (variance > 0)] for part in parts))
 
@@ -297,7 +295,7 @@ class _System:
         """Return Tukey's weights over the variance, and the derivative of the influence."""
         variance = row.variance * self.scale[self.ends[k]] ** 2
         variance += inflation_m**2
-        e2 = row.r**2 / (variance * _ROBUST**2)
+        e2 = row.r**2 / (variance * projective.ROBUST**2)
         return tukey.weights(e2) / variance, tukey.slopes(e2) / variance
 
     def step(self, inflation_m: float) -> float:

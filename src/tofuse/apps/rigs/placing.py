@@ -14,7 +14,6 @@ import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 
@@ -36,8 +35,6 @@ from tofuse.engine.search import (
 )
 from tofuse.engine.stored_views import SampledView
 from tofuse.engine.views import PreparedView
-
-V = TypeVar("V")
 
 # Numbers of instants that are searched, scored and refined; more are better in a dynamic scene.
 _SEARCHED, _SCORED, _REFINED = 2, 4, 2
@@ -117,7 +114,7 @@ class _Placer:
         full = [m for m in instants if all(self._views[c][m] is not None for c in self._depth)]
         return [
             RigView(c, m, SampledView.of(view, _POINTS))
-            for m in _evenly(full or list(instants), _REFINED)
+            for m in evenly_spaced(full or instants, _REFINED)
             for c, views in enumerate(self._views)
             if (view := views[m]) is not None
         ]
@@ -132,9 +129,10 @@ class _Placer:
             and verification.comparable(first.depth, second.depth)
         ]
         self._comparisons[a, b] = [
-            pair_agreement.Comparison.of(s, t, self._agreement) for t, s in _evenly(pairs, _SCORED)
+            pair_agreement.Comparison.of(s, t, self._agreement)
+            for t, s in evenly_spaced(pairs, _SCORED)
         ]
-        proposals = [self._propose(t, s) for t, s in _evenly(pairs, _SEARCHED)]
+        proposals = [self._propose(t, s) for t, s in evenly_spaced(pairs, _SEARCHED)]
         poses = np.concatenate([np.zeros((0, 4, 4)), *proposals])
         scores = np.array([self._agreement_at(a, b, T)[_SCORE] for T in poses])
         order = [k for k in np.argsort(-scores, kind="stable") if scores[k] > 0]
@@ -331,8 +329,3 @@ class _Placer:
                 f"the points: the margin occurs by chance in {chance:.0%} of the cases"
             )
         return 1 - chance, ""
-
-
-def _evenly(items: Sequence[V], count: int) -> list[V]:
-    """Return at most `count` of the items, evenly spaced."""
-    return [items[k] for k in evenly_spaced(np.arange(len(items)), count)]

@@ -220,9 +220,7 @@ def _spaced_instants(
         selected = [posed[0]]
         for k in posed[1:]:
             motion = se3.inverse(poses[selected[-1]]) @ poses[k]
-            rotated = se3.angle(motion) >= _SPACING.angle * stretch
-            translated = np.linalg.norm(motion[:3, 3]) >= _SPACING.distance * stretch * depth
-            if rotated or translated:
+            if _SPACING.is_exceeded(motion, depth, stretch):
                 selected.append(k)
         if len(selected) <= max_instants:
             return np.array(selected, np.intp)

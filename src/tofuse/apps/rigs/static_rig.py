@@ -27,7 +27,7 @@ from tofuse.engine.filters import BackgroundSurface, background_surface
 from tofuse.engine.frames import RangeFrame, evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.noise import noise_model_for
-from tofuse.engine.normal import MEDIAN_OF_NORMAL
+from tofuse.engine.normal import robust_sigma
 from tofuse.engine.progress import Progress
 from tofuse.engine.stored_views import SampledView
 from tofuse.engine.views import PreparedView
@@ -358,7 +358,7 @@ def _activity(camera: Camera) -> tuple[Float64, Float64]:
         if previous is not None:
             valid = previous.valid & frame.valid
             change = np.abs(frame.z - previous.z)[valid]
-            noise = float(np.median(change)) / MEDIAN_OF_NORMAL if len(change) else 0.0
+            noise = robust_sigma(change) if len(change) else 0.0
             limit = np.maximum(5 * noise, 0.01 * previous.z[valid])
             times.append(0.5 * (previous.timestamp + frame.timestamp))
             fractions.append(float((change > limit).mean()) if len(change) else 0.0)

@@ -9,7 +9,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import Frame
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, unit_vectors
 
 # Minimum probability of a pose that other evidence may confirm.
 PROBABLE = 0.5
@@ -49,7 +49,7 @@ class Registration:
         Whether the pose is verified; None for methods that don't verify. `converged` does not imply
         it: iterations converge at wrong poses too.
     probability
-        That the pose is right, 0 to 1, see `registration.pose_probability`; None for methods that
+        That the pose is right, 0 to 1, see `search.pose_probability`; None for methods that
         don't estimate it.
     reason
         Why the pose is rejected, in words; empty otherwise.
@@ -200,14 +200,12 @@ class Registration:
         adjoint, inverse_adjoint = (
             se3.adjoint(T) for T in (T_reference_b, se3.inverse(T_reference_b))
         )
-        unobservable = self.unobservable @ inverse_adjoint.T
-        lengths = np.linalg.norm(unobservable, axis=1, keepdims=True)
         runner_up = self.runner_up
         return replace(
             self,
             T_target_source=T_a_target @ self.T_target_source @ T_source_b,
             information=adjoint.T @ self.information @ adjoint,
-            unobservable=unobservable / np.maximum(lengths, 1e-12),
+            unobservable=unit_vectors(self.unobservable @ inverse_adjoint.T),
             reference_point=np.zeros(3),
             runner_up=None if runner_up is None else T_a_target @ runner_up @ T_source_b,
         )
@@ -253,8 +251,8 @@ class Registrar(Protocol):
 
     @property
     def takes(self) -> frozenset[str]:
-        """Kinds of view it works on: "range", "cloud"."""
-        ...
+        """Kinds of view it works on: "range", "cloud"; by default both."""
+        return frozenset({"range", "cloud"})
 
     def register(
         self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator

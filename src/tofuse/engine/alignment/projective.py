@@ -19,12 +19,21 @@ from tofuse.engine.alignment.base import Registration
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute import median
+from tofuse.engine.geometry import unit_vectors
 from tofuse.engine.views import PreparedView, SurfaceOptions
 from tofuse.engine.views import residual_kernels as kernels
 
 # A direction is constrained if its sigma is at most 1 cm, or 1 degree.
 UNITS = np.array([0.01] * 3 + [np.radians(1.0)] * 3)
 WEAK = 1e-3  # information of a weak prior in `UNITS`
+# Residuals beyond this many sigmas have no weight; nor have points on surfaces with other normals.
+ROBUST, MIN_COSINE = 3.5, math.cos(0.7)
+# Largest sigma of a typical distance where views disagree, m. It covers noise that neighbouring
+# pixels share, which plane fits do not show.
+MAX_SIGMA_M = 0.02
+# A level ends when a step is smaller, and an alignment has converged if its last step was, in units
+# of 1 cm and 1 degree.
+_TOLERANCE, _CONVERGENCE = 0.01, 0.1
 # Below this depth, noise inflation is reduced in proportion to the depth.
 _NEAR_M = 1.0
 # With fewer points the noise scale, their median residual, has an error above 8 %.
@@ -67,10 +76,6 @@ class ProjectiveOptions:
     ----------
     levels
         Coarse to fine. Strides are halved for views with few pixels.
-    robust
-        Residuals beyond this many sigmas have no weight.
-    max_angle
-        Largest angle between the normals of source and target, rad.
     photometric
         Whether photometric residuals of the albedo are used.
     prior_m, prior_rad
@@ -81,13 +86,6 @@ class ProjectiveOptions:
     common_tilt, common_slope
         Errors fixed to the camera, which distort both views equally and cause spurious information:
         standard deviation of normals in rad, and of the log albedo's slopes by ray coordinate.
-    max_sigma_m
-        Largest sigma of a typical distance where the views disagree, m. It covers noise that
-        neighbouring pixels share, which plane fits do not show.
-    tolerance
-        A level ends when a step is smaller, in units of 1 cm and 1 degree.
-    convergence
-        An alignment has converged if its last step was smaller, in the same units.
     """
 
     levels: tuple[Level, ...] = (
@@ -95,17 +93,12 @@ class ProjectiveOptions:
         Level(4, 2, 0.005, 0.02),
         Level(2, 2, 0.0, 0.0),
     )
-    robust: float = 3.5
-    max_angle: float = 0.7
     photometric: bool = True
     prior_m: float = 0.3
     prior_rad: float = 0.3
     constrained: float = 1.0
     common_tilt: float = 0.03
     common_slope: float = 0.1
-    max_sigma_m: float = 0.02
-    tolerance: float = 0.01
-    convergence: float = 0.1
 
 
 def points_of(view: PreparedView, stride: int) -> Float32:
@@ -229,8 +222,6 @@ def registration_of(aligned: Aligned, T_target_source: Float64, C: Float64) -> R
     C
         (6, 6) covariance of the right perturbation, m and rad.
     """
-    directions = aligned.unobservable * UNITS
-    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     return Registration(
         T_target_source=T_target_source,
         converged=aligned.converged,
@@ -240,7 +231,7 @@ def registration_of(aligned: Aligned, T_target_source: Float64, C: Float64) -> R
         error=aligned.scale,
         rms_m=aligned.rms_m,
         information=np.asarray(np.linalg.inv(C), np.float64),
-        unobservable=directions / np.maximum(lengths, 1e-12),
+        unobservable=unit_vectors(aligned.unobservable * UNITS),
     )
 
 
@@ -285,7 +276,7 @@ def align(
     max_scale = 10.0  # relative to the stated sigmas of the views
     if len(points):
         sigma = points[:, kernels.SIGMA] * points[:, kernels.POINT + 2]
-        max_scale = max(3.0, options.max_sigma_m / median(sigma), _MAX_SCALE_RATIO * usual_scale)
+        max_scale = max(3.0, MAX_SIGMA_M / median(sigma), _MAX_SCALE_RATIO * usual_scale)
     depth_factor = min(1.0, source.depth / _NEAR_M) if source.depth > 0 else 1.0
     images = tuple(t.view.target_image for t in targets)
     if len(images) > 1:  # kernels are compiled for one target, and for a few
@@ -298,12 +289,12 @@ def align(
             points = _points_of_level(source, level)
         settings = steps.LevelSettings(
             level.iterations,
-            options.tolerance,
+            _TOLERANCE,
             max_scale,
             level.inflation_m * depth_factor,
             level.photometric_inflation,
-            options.robust,
-            math.cos(options.max_angle),
+            ROBUST,
+            MIN_COSINE,
             remap=index > 0,  # at the coarsest level the views are not yet aligned
             tilt=options.common_tilt,
             slope=options.common_slope,
@@ -319,7 +310,7 @@ def align(
     noise_scale = steps.scale_of_distances(total[kernels.HISTOGRAM :])
     return Aligned(
         T_world_source=T,
-        converged=step_size < options.convergence,
+        converged=step_size < _CONVERGENCE,
         iterations=iterations,
         information=steps.information(total),
         cross=steps.cross_information(total) - spurious,

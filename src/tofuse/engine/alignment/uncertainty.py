@@ -16,7 +16,6 @@ true pose, and its covariance ``X^-1 B X^-1`` with X the derivative of g and B i
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -24,7 +23,14 @@ from functools import cache
 import numpy as np
 
 from tofuse.engine.alignment import tile_sum_kernels as kernels
-from tofuse.engine.alignment.projective import UNITS, Aligned, ProjectiveOptions, Target
+from tofuse.engine.alignment.projective import (
+    MIN_COSINE,
+    ROBUST,
+    UNITS,
+    Aligned,
+    ProjectiveOptions,
+    Target,
+)
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import median
 from tofuse.engine.geometry import distance_and_angle
@@ -149,8 +155,8 @@ def patches(
         aligned.scale,
         aligned.photo_scale if photometric else 0.0,
         0.0,
-        alignment.robust,
-        math.cos(alignment.max_angle),
+        ROBUST,
+        MIN_COSINE,
     )
     sums_per_target = []
     upper = np.zeros((kernels.KINDS, kernels.UPPER))
@@ -205,7 +211,7 @@ def covariance_of_patches(sums: Patches, options: UncertaintyOptions) -> Float64
         x, y = sums.positions.T
         distance = np.hypot(x[:, None] - x, y[:, None] - y)
         correlation = np.exp(-distance / options.reach)
-        observed = _observed_variance(sums, bread, correlation, options)
+        observed = _observed_variance(sums, bread, correlation)
         hidden = (options.hidden * sums.depth * sums.change) ** 2
         hidden_correlation = np.exp(-0.5 * distance / options.reach) + options.offset**2
         B += (
@@ -278,9 +284,7 @@ def bounded_by_prior(C: Float64, prior: Float64) -> Float64:
     return 0.5 * (bounded + bounded.T)
 
 
-def _observed_variance(
-    sums: Patches, bread: Float64, correlation: Float64, options: UncertaintyOptions
-) -> float:
+def _observed_variance(sums: Patches, bread: Float64, correlation: Float64) -> float:
     """Estimate the variance in m^2 of the correlated errors of patches from the residuals.
 
     Method of moments, corrected for the degrees of freedom of the fit: residuals are (1 - P) times

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64
+from tofuse.engine.cameras import projection_kernels as kernels
 from tofuse.engine.errors import InputError
 
 
@@ -90,6 +91,7 @@ class Pinhole:
     cy: float
 
     model = "pinhole"
+    tangential_factor = 2.0  # how often the mixed terms of p1 and p2 count
 
     def __post_init__(self) -> None:
         check_intrinsics(self)
@@ -105,12 +107,18 @@ class Pinhole:
     def project(self, points: ArrayLike) -> Float64:
         """Project points (..., 3) in m; see `Camera.project`."""
         points = np.asarray(points, float)
-        z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
-        distorted = self._distort(points[..., :2] / z[..., None])
-        return distorted * (self.fx, self.fy) + (self.cx, self.cy)
+        flat = np.ascontiguousarray(points.reshape(-1, 3))
+        return kernels.project_by_lens(flat, self._lens).reshape(*points.shape[:-1], 2)
+
+    @cached_property
+    def _lens(self) -> kernels.Lens:
+        names = kernels.Lens._fields[:-2]
+        values = [float(getattr(self, name, 0.0)) for name in names]
+        return kernels.Lens._make([*values, isinstance(self, Fisheye), self.tangential_factor])
 
     def _distort(self, xy: Float64) -> Float64:
-        return xy
+        flat = np.ascontiguousarray(xy.reshape(-1, 2))
+        return kernels.distort(flat, self._lens).reshape(xy.shape)
 
     def _undistort(self, xy: Float64) -> Float64:
         """Invert `_distort` by Newton's method with a numeric Jacobian; NaN where it fails."""
@@ -155,11 +163,6 @@ class BrownConrady(Pinhole):
 
     model = "brown"
 
-    def _distort(self, xy: Float64) -> Float64:
-        r2 = (xy * xy).sum(-1)
-        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        return xy * radial[..., None] + _tangential(xy, r2, self.p1, self.p2)
-
 
 @dataclass(frozen=True)
 class Rational(BrownConrady):
@@ -170,12 +173,6 @@ class Rational(BrownConrady):
     k6: float = 0.0
 
     model = "rational"
-
-    def _distort(self, xy: Float64) -> Float64:
-        r2 = (xy * xy).sum(-1)
-        above = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        below = 1 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
-        return xy * (above / below)[..., None] + _tangential(xy, r2, self.p1, self.p2)
 
 
 @dataclass(frozen=True)
@@ -188,11 +185,6 @@ class Fisheye(Pinhole):
     k4: float = 0.0
 
     model = "fisheye"
-
-    def _distort(self, xy: Float64) -> Float64:
-        r = np.sqrt((xy * xy).sum(-1))
-        distorted = self._distorted_angle(np.arctan(r))
-        return xy * np.where(r > 1e-9, distorted / np.where(r > 1e-9, r, 1), 1.0)[..., None]
 
     def _distorted_angle(self, theta: Float64) -> Float64:
         t2 = theta * theta
@@ -388,13 +380,6 @@ def scaled(camera: Pinhole, width: int, height: int) -> Pinhole:
 def _pixel_grid(camera: Pinhole) -> Float64:
     v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(float)
     return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], -1)
-
-
-def _tangential(xy: Float64, r2: Float64, p1: float, p2: float) -> Float64:
-    x, y = xy[..., 0], xy[..., 1]
-    return np.stack(
-        [2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1
-    )
 
 
 def _frozen(a: Float32) -> Float32:

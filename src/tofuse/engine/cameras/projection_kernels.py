@@ -1,9 +1,11 @@
 """Projection of a point into a view, and the Jacobian of a point under a perturbation.
 
-And the radial distortion of a lens, by the coefficients of `lens.fitted`.
+And the lenses of `cameras`; and the radial distortion by the coefficients of `lens.fitted`.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +15,75 @@ from tofuse.engine.compute import inlined, kernel
 MIN_DEPTH = 0.02  # m; points nearer to a camera are not projected
 # Smallest slope of a lens's distortion, and Newton iterations that invert it.
 MIN_SLOPE, _ITERATIONS = 0.1, 3
+
+
+class Lens(NamedTuple):
+    """The lens of a camera, in pixels.
+
+    Attributes
+    ----------
+    fx, fy, cx, cy
+        Of a pinhole camera.
+    k1, k2, p1, p2, k3, k4, k5, k6
+        Distortion in the order of OpenCV; 0 where the model has none.
+    angular
+        Whether k1 to k4 are of the angle to the axis (fisheye), not of its tangent.
+    tangential
+        How often the mixed tangential terms count: twice in OpenCV.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k1: float
+    k2: float
+    p1: float
+    p2: float
+    k3: float
+    k4: float
+    k5: float
+    k6: float
+    angular: bool
+    tangential: float
+
+
+@kernel
+def _distorted(x: float, y: float, lens: Lens) -> tuple[float, float]:
+    r2 = x * x + y * y
+    if lens.angular:
+        r = np.sqrt(r2)
+        theta = np.arctan(r)
+        t2 = theta * theta
+        theta *= 1 + t2 * (lens.k1 + t2 * (lens.k2 + t2 * (lens.k3 + t2 * lens.k4)))
+        scale = theta / r if r > 1e-9 else 1.0
+        return x * scale, y * scale
+    above = 1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
+    scale = above / (1 + r2 * (lens.k4 + r2 * (lens.k5 + r2 * lens.k6)))
+    mixed_u, mixed_v = lens.tangential * lens.p1 * x * y, lens.tangential * lens.p2 * x * y
+    u = x * scale + (mixed_u + lens.p2 * (r2 + 2 * x * x))
+    return u, y * scale + (lens.p1 * (r2 + 2 * y * y) + mixed_v)
+
+
+@kernel
+def distort(rays: Float64, lens: Lens) -> Float64:
+    """Return rays (N, 2) as distorted by the lens."""
+    out = np.empty_like(rays)
+    for k in range(len(rays)):
+        out[k, 0], out[k, 1] = _distorted(rays[k, 0], rays[k, 1], lens)
+    return out
+
+
+@kernel
+def project_by_lens(points: Float64, lens: Lens) -> Float64:
+    """Return the pixels (N, 2) of points (N, 3) in the camera's frame; NaN if z <= 0."""
+    out = np.full((len(points), 2), np.nan)
+    for k in range(len(points)):
+        z = points[k, 2]
+        if z > 0:
+            u, v = _distorted(points[k, 0] / z, points[k, 1] / z, lens)
+            out[k, 0], out[k, 1] = u * lens.fx + lens.cx, v * lens.fy + lens.cy
+    return out
 
 
 @kernel

@@ -1,6 +1,6 @@
 """Covariance of the pose between two point clouds.
 
-As for images (`registration.uncertainty`) the covariance is that of an M-estimate, ``X^-1 B X^-1``
+As for images (`alignment.uncertainty`) the covariance is that of an M-estimate, ``X^-1 B X^-1``
 (Huber 1981, ch. 6): X is the Hessian, from the product of both views' normals, in which their
 noise cancels, and B the covariance of the gradient. The error model of a cloud is unknown, so B is
 estimated from the residuals at the final pose. The relative distortion of the clouds, by
@@ -21,7 +21,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds.cloud_agreement import NEIGHBOURS, CloudMap
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, unit_vectors
 from tofuse.engine.icp import surface_metrics
 from tofuse.engine.normal import robust_sigma
 
@@ -131,8 +131,7 @@ class _Pairs:
         p, q, a = p[matched], q[matched], a[matched]
         b = b[matched] * np.sign(cosine[matched])[:, None]
         # Of a normal and its opposite the one with its largest component positive.
-        n = a + b
-        n /= np.linalg.norm(n, axis=1, keepdims=True)
+        n = unit_vectors(a + b)
         largest = np.take_along_axis(n, np.abs(n).argmax(1)[:, None], 1)
         n, a, b = (v * np.sign(largest) for v in (n, a, b))
         r = ((p - q) * n).sum(1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -51,7 +50,6 @@ class AnyPair(Registrar):
     """
 
     search: bool = True
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def register(
         self, source: Frame, target: Frame, guess: Float64 | None, rng: np.random.Generator

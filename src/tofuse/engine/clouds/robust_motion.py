@@ -203,10 +203,7 @@ def motions_of(p: Float64, q: Float64, weight: Float64) -> Float64:
 def _motions_from(H: Float64, p0: Float64, q0: Float64) -> Float64:
     """Return motions (k, 4, 4) from covariances (k, 3, 3) and centroids (k, 3) of the pairs."""
     R = se3.nearest_rotation(np.swapaxes(H, 1, 2))
-    T = np.tile(np.eye(4), (len(H), 1, 1))
-    T[:, :3, :3] = R
-    T[:, :3, 3] = q0 - np.einsum("kij,kj->ki", R, p0)
-    return T
+    return se3.pose(R, q0 - np.einsum("kij,kj->ki", R, p0))
 
 
 def squared_residuals(pairs: Pairs, motions: Float64) -> Float64:

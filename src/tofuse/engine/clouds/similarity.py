@@ -22,7 +22,7 @@ from tofuse.engine.clouds.cloud_pair import register_clouds, scaled
 from tofuse.engine.clouds.fpfh import POINTS, candidates
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, unit_vectors
 from tofuse.engine.icp import extent, reduced, spacing, surface_metrics
 from tofuse.engine.search import pose_probability
 
@@ -188,8 +188,7 @@ class _Pair:
         # With the mean normal, distances along a curved surface cancel (Rusinkiewicz 2019); with
         # one of both a convex body would grow.
         p = moved[matched]
-        n = normals[matched] + np.sign(cosine[matched, None]) * own_normals[matched]
-        n /= np.linalg.norm(n, axis=1, keepdims=True)
+        n = unit_vectors(normals[matched] + np.sign(cosine[matched, None]) * own_normals[matched])
         centre = p.mean(0)
         arm = p - centre
         size = float(np.sqrt((arm**2).sum(1).mean()))

@@ -349,7 +349,7 @@ def _always_occluded(z: Float32, passing: Float32, frequency: Float64) -> Bool:
 
 
 def _filled(z: Float32) -> Float32:
-    """Fill the zeros of an image (H, W) from the nearest valid pixel within `_NEAR_PIXELS`."""
+    """Fill the zeros of an image (H, W) from the nearest valid pixel within `_FILL_PIXELS`."""
     distance, nearest = ndimage.distance_transform_edt(z <= 0, return_indices=True)
     return np.where(distance <= _FILL_PIXELS, z[tuple(nearest)], np.float32(0))
 

@@ -18,7 +18,7 @@ class Filter(Protocol):
     Attributes
     ----------
     takes
-        Kinds of view it accepts: "range", "cloud".
+        Kinds of view it accepts: "range", "cloud"; by default both.
     window
         Number of frames it uses, the current one included; 1 for all but temporal filters.
     needs_fit
@@ -26,7 +26,7 @@ class Filter(Protocol):
     """
 
     part_kind: ClassVar[str] = "filter"
-    takes: ClassVar[frozenset[str]]
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     @property
     def window(self) -> int:

@@ -42,8 +42,6 @@ class NeighbourFraction(Bounded, Filter):
     fraction: Annotated[float, Bounds(0, 1)] = 0.5
     k: Annotated[int, Bounds(1, MAX_NEIGHBOURS)] = 3
 
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""
         distance = mean_neighbour_distance(frame.points, self.k)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -31,8 +31,6 @@ class Distance(Interval, Filter):
 
     measure: Literal["z", "range"] = "z"
 
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""
         if isinstance(frame, RangeFrame) and self.measure == "z":
@@ -58,8 +56,6 @@ class Confidence(Bounded, Filter):
 
     minimum: Annotated[int, Bounds(0)] = 7
     highest: Annotated[int, Bounds(1, 255)] = 7
-
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
         super().__post_init__()

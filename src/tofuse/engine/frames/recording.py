@@ -40,7 +40,7 @@ class Source(Protocol):
         (N, 4, 4) T_world_camera from odometry, NaN where unknown; or None.
     gravity
         (N, 4) unit vector along gravity in the camera's frame, and its standard deviation in rad
-        (`recordings.imu`), NaN where unknown; or None.
+        (`sources.imu`), NaN where unknown; or None.
     warnings
         Notes for the user on how the recording was read so far, one line each.
     metadata
@@ -206,9 +206,9 @@ class Recording:
         Unreadable frames are replaced by their error.
         """
         items: list[Frame | UnreadableFrameError] = []
-        for k in evenly_spaced(np.arange(len(self)), count):
+        for k in evenly_spaced(range(len(self)), count):
             try:
-                items.append(self[int(k)])
+                items.append(self[k])
             except UnreadableFrameError as error:
                 items.append(error)
         return items
@@ -287,9 +287,16 @@ class Recording:
             pool.shutdown(cancel_futures=True)
 
 
-def evenly_spaced(items: NDArray[S], count: int) -> NDArray[S]:
+@overload
+def evenly_spaced(items: NDArray[S], count: int) -> NDArray[S]: ...
+
+
+@overload
+def evenly_spaced(items: Sequence[R], count: int) -> list[R]: ...
+
+
+def evenly_spaced(items: Any, count: int) -> Any:
     """Return at most `count` of the items, evenly spaced, including the first and the last."""
-    if len(items) == 0:
-        return items
-    positions = np.linspace(0, len(items) - 1, min(count, len(items))).round()
-    return items[np.unique(positions.astype(np.intp))]
+    spaced = np.linspace(0, len(items) - 1, min(count, len(items))).round()
+    positions = np.unique(spaced.astype(np.intp))
+    return items[positions] if isinstance(items, np.ndarray) else [items[k] for k in positions]

@@ -1,4 +1,4 @@
-"""Points and unit vectors along rays, which cameras give as (x/z, y/z)."""
+"""Unit vectors; and points along rays, which cameras give as (x/z, y/z)."""
 
 from __future__ import annotations
 
@@ -16,5 +16,10 @@ def homogeneous(rays: ArrayLike) -> Float64:
 
 def unit_rays(rays: ArrayLike) -> Float64:
     """Return the unit vectors (..., 3) of rays (..., 2)."""
-    points = homogeneous(rays)
-    return np.asarray(points / np.linalg.norm(points, axis=-1, keepdims=True), np.float64)
+    return unit_vectors(homogeneous(rays))
+
+
+def unit_vectors(vectors: ArrayLike) -> Float64:
+    """Return vectors (..., n) of length 1, zeros of zeros."""
+    vectors = np.asarray(vectors, float)
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)

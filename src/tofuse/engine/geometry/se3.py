@@ -93,11 +93,8 @@ def left_jacobian_inverse(w: ArrayLike) -> Float64:
 def exp(xi: ArrayLike) -> Float64:
     """Rigid motion (..., 4, 4) of a twist (..., 6): the full SE(3) exponential."""
     xi = np.asarray(xi, float)
-    T = np.zeros((*xi.shape[:-1], 4, 4))
-    T[..., :3, :3] = so3_exp(xi[..., 3:])
-    T[..., :3, 3] = (left_jacobian(xi[..., 3:]) @ xi[..., :3, None])[..., 0]
-    T[..., 3, 3] = 1
-    return T
+    t = (left_jacobian(xi[..., 3:]) @ xi[..., :3, None])[..., 0]
+    return pose(so3_exp(xi[..., 3:]), t)
 
 
 def log(T: ArrayLike) -> Float64:
@@ -111,12 +108,8 @@ def log(T: ArrayLike) -> Float64:
 def inverse(T: ArrayLike) -> Float64:
     """Inverse of rigid motions (..., 4, 4): ``T_b_a`` from ``T_a_b``."""
     T = np.asarray(T, float)
-    out = np.zeros_like(T)
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
-    out[..., :3, :3] = Rt
-    out[..., :3, 3] = -(Rt @ T[..., :3, 3, None])[..., 0]
-    out[..., 3, 3] = 1
-    return out
+    return pose(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
 
 
 def adjoint(T: ArrayLike) -> Float64:
@@ -142,9 +135,10 @@ def about(centre: ArrayLike, T: ArrayLike) -> Float64:
 
 
 def pose(R: ArrayLike, t: ArrayLike = 0.0) -> Float64:
-    """Return the motion (4, 4) with a rotation matrix (3, 3) and a translation (3,)."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
+    """Return the motions (..., 4, 4) of rotation matrices (..., 3, 3) and translations (..., 3)."""
+    R = np.asarray(R, float)
+    T = np.zeros((*R.shape[:-2], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1
     return T
 
 
@@ -204,9 +198,15 @@ def is_within(T: ArrayLike, metres: float, rad: float) -> bool:
 
 
 def lengths(T: ArrayLike) -> Float64:
-    """Lengths, m, and angles, rad, (K, 2) of motions (K, 4, 4)."""
+    """Lengths, m, and angles, rad, (..., 2) of motions (..., 4, 4)."""
     T = np.asarray(T, float)
-    return np.stack([np.linalg.norm(T[:, :3, 3], axis=1), angle(T)], axis=1)
+    return np.stack([np.linalg.norm(T[..., :3, 3], axis=-1), angle(T)], axis=-1)
+
+
+def change_of_view(T: ArrayLike, depth: ArrayLike) -> Float64:
+    """How far motions (..., 4, 4) move a view of this depth, m: as a fraction of it, plus rad."""
+    length, rotation = np.moveaxis(lengths(T), -1, 0)
+    return np.asarray(length / np.asarray(depth) + rotation)
 
 
 def largest_sigmas(C: ArrayLike) -> Float64:

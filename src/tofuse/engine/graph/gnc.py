@@ -88,9 +88,7 @@ def chordal_poses(
     )
     if columns is None:
         return None
-    out = np.tile(np.eye(4), (len(poses), 1, 1))
-    out[:, :3, :3] = np.swapaxes(Rt + columns, 1, 2)
-    out = se3.orthonormalise(out)
+    out = se3.pose(se3.nearest_rotation(np.swapaxes(Rt + columns, 1, 2)))
     out[fixed] = poses[fixed]
     R = out[:, :3, :3]
 

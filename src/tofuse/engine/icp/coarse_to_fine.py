@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -72,7 +72,6 @@ class CoarseToFine(Bounded, Registrar):
     neighbours: int = 12
     max_iterations: int = 40
     coarsest: Annotated[float | None, Bounds(0, exclusive=True)] = None
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def register(
         self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator

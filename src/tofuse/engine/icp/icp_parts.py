@@ -8,7 +8,7 @@ the iterations. Metrics with normals are in `surface_metrics`, rarer parts in th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import Frame
-from tofuse.engine.geometry import KdTree
+from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.icp import icp_kernels, interfaces, surface_shape
 from tofuse.engine.parts import part
 
@@ -88,8 +88,6 @@ class Uniform(Bounded, interfaces.Selector):
 @dataclass(frozen=True)
 class ClosestPoint(interfaces.Matcher):
     """The closest point of the target (Besl and McKay 1992), by a kd-tree (section 2.9.5)."""
-
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def prepare(self, target: interfaces.Points) -> interfaces.Search:
         """Build the tree, once for all iterations: the target doesn't move.
@@ -191,10 +189,8 @@ class PointToPoint(interfaces.Metric):
             raise RegistrationError("the corresponding points lie on a line")
         if np.linalg.det(U) * np.linalg.det(Vt) < 0:
             Vt[2] *= -1
-        T = np.eye(4)
-        T[:3, :3] = (U @ Vt).T
-        T[:3, 3] = m0 - T[:3, :3] @ d0
-        return T
+        R = (U @ Vt).T
+        return se3.pose(R, m0 - R @ d0)
 
     def information(self, matches: interfaces.Matches, alignment: interfaces.Alignment) -> Float64:
         """Return ``sum w J^T J / sigma^2`` with ``J = R [I, -hat(p)]``, p in the source's frame.

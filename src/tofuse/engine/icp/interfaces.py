@@ -189,7 +189,7 @@ class Matcher(Protocol):
     """Finds which point of the target corresponds to a point of the source (section 2.9.3)."""
 
     part_kind: ClassVar[str] = "matcher"
-    takes: ClassVar[frozenset[str]]
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def prepare(self, target: Points) -> Search:
         """Precompute what depends on the target only, a kd-tree for example."""

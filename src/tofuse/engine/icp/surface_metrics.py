@@ -15,7 +15,7 @@ from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.errors import RegistrationError
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, unit_vectors
 from tofuse.engine.icp.icp_kernels import (
     direction_products,
     matrix_sums,
@@ -170,7 +170,7 @@ def shared_weights(matches: Matches, alignment: Alignment) -> Float64:
 def in_scales(residual: Float64, resolution: float) -> Float64:
     """Return absolute residuals (m,), in m, relative to their robust scale.
 
-    The scale is 1.4826 times their median, at least a thousandth of the resolution.
+    The scale is their `robust_sigma`, at least a thousandth of the resolution.
     """
     magnitude = np.abs(residual)
     return np.asarray(magnitude / max(robust_sigma(magnitude), _MIN_SIGMA_RATIO * resolution))
@@ -243,7 +243,7 @@ def unobservable_directions(pairs: SurfacePairs, variance: float) -> Float64:
     )
     constrained = (values > 1) & (cross > _MIN_SIGNAL_FRACTION * plain)
     unobservable = directions[~constrained] @ se3.adjoint(se3.translation(pairs.centre)).T
-    return unobservable / np.linalg.norm(unobservable, axis=1, keepdims=True)
+    return unit_vectors(unobservable)
 
 
 class SurfaceMetric(Metric, Protocol):

@@ -24,6 +24,7 @@ from tofuse.engine.loops.merged_components import (
     motion_over,
     transformed,
 )
+from tofuse.engine.normal import robust_sigma
 from tofuse.engine.search import (
     are_distinct_poses,
     follow,
@@ -86,8 +87,7 @@ class JoinChecks:
         ]
         options = projective.ProjectiveOptions(levels=verification.PATIENT)
         contradictions = []
-        for k in evenly_spaced(np.arange(len(pairs)), _MAX_LEARNT_PAIRS):
-            a, b = pairs[k]
+        for a, b in evenly_spaced(pairs, _MAX_LEARNT_PAIRS):
             T_a_b = se3.inverse(a.T_component_camera) @ b.T_component_camera
             aligned = projective.align(b.view, [projective.Target(a.view)], T_a_b, options)
             if aligned.overlap >= _OVERLAP:
@@ -98,7 +98,7 @@ class JoinChecks:
                 contradictions.append(result.contradiction)
         if len(contradictions) > 3:
             median = float(np.median(contradictions))
-            spread = 1.48 * float(np.median(np.abs(np.array(contradictions) - median)))
+            spread = robust_sigma(np.array(contradictions) - median)
             limit = median + _SIGMAS * max(spread, _MIN_SPREAD)
             self.max_contradiction = max(self.max_contradiction, min(limit, _MAX_CONTRADICTION))
 
@@ -114,9 +114,7 @@ class JoinChecks:
         Ta = np.stack([self._merged.T_merged(a, v.index) for v in views_a])
         Tb = np.stack([T_a_b @ self._merged.T_merged(b, v.index) for v in views_b])
         for p, v in enumerate(views_a):
-            relative = se3.inverse(Ta[p]) @ Tb
-            translation = np.linalg.norm(relative[:, :3, 3], axis=1) / v.depth
-            distance = translation + np.asarray(se3.angle(relative))
+            distance = se3.change_of_view(se3.inverse(Ta[p]) @ Tb, v.depth)
             candidates += [
                 (float(distance[q]), p, int(q))
                 for q in np.flatnonzero(distance < verification.MAX_OVERLAP_DISTANCE)

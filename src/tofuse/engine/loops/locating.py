@@ -20,7 +20,7 @@ import numpy as np
 from tofuse.engine.alignment import covariance, projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import one_blas_thread, run_all
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, unit_vectors
 from tofuse.engine.loops.join_checks import JoinChecks
 from tofuse.engine.loops.merged_components import DRIFT, MergedComponents, TrackedComponent, View
 from tofuse.engine.search import (
@@ -101,10 +101,10 @@ class Location:
         are directions that tracking did not constrain: with any, it is not accepted.
         """
         A = se3.adjoint(se3.inverse(T_view_other))
-        shift, angle = se3.lengths(T_view_other[None])[0] * DRIFT
+        shift, angle = se3.lengths(T_view_other) * DRIFT
         sigma = np.repeat([shift + angle * depth, angle + shift / depth], 3)
         rival = self.runner_up
-        free = free / np.maximum(np.linalg.norm(free, axis=1, keepdims=True), 1e-12)
+        free = unit_vectors(free)
         drifted = "tracking from the nearest located frame does not constrain all directions"
         return replace(
             self,
@@ -309,10 +309,8 @@ class Locator:
         return chosen
 
     def _distances(self, T: Float64, which: Sequence[int] | slice = slice(None)) -> Float64:
-        """Return the distances of map views from a pose: fraction of the depth plus rad."""
-        motion = se3.inverse(T) @ self._poses[which]
-        shift = np.linalg.norm(motion[:, :3, 3], axis=1) / self._depths[which]
-        return np.asarray(shift + np.asarray(se3.angle(motion)), np.float64)
+        """Return the changes of view from a pose (4, 4) to map views."""
+        return se3.change_of_view(se3.inverse(T) @ self._poses[which], self._depths[which])
 
     def _is_near(self, T: Float64, k: int) -> bool:
         return bool(self._distances(T, [k])[0] < verification.MAX_OVERLAP_DISTANCE)
@@ -426,9 +424,9 @@ class Locator:
     def _scores_elsewhere(self, T_map_view: Float64, places: Sequence[_Place]) -> list[float]:
         """Return the scores of a view's poses in other places than a pose (4, 4)."""
         poses = np.array([place.T_map_view for place in places]).reshape(-1, 4, 4)
-        lengths = se3.lengths(se3.inverse(T_map_view) @ poses)
         depths = self._depths[[place.k for place in places]]
-        elsewhere = lengths[:, 0] / depths + lengths[:, 1] > verification.MAX_OVERLAP_DISTANCE
+        change = se3.change_of_view(se3.inverse(T_map_view) @ poses, depths)
+        elsewhere = change > verification.MAX_OVERLAP_DISTANCE
         return [p.score for p, other in zip(places, elsewhere, strict=True) if other]
 
     def _independence(
@@ -438,8 +436,8 @@ class Locator:
         if not counted:
             return 1.0
         motions = se3.inverse(np.array(ends)) @ np.array(counted)
-        lengths = se3.lengths(motions.reshape(-1, 4, 4))
-        apart = (lengths[:, 0] / self._depths[k] + lengths[:, 1]).reshape(-1, 2).max(1).min()
+        change = se3.change_of_view(motions, self._depths[k])
+        apart = change.reshape(-1, 2).max(1).min()
         return min(1.0, float(apart) / verification.MAX_OVERLAP_DISTANCE)
 
     def _location(
@@ -465,7 +463,7 @@ class Locator:
         return Location(
             placed.T_map_camera,
             C,
-            directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12),
+            unit_vectors(directions),
             probability,
             "; ".join(reasons),
             None if rival is None else rival.T_map_clip @ view.T_component_camera,

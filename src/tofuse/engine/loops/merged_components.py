@@ -22,7 +22,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from tofuse.engine.alignment import Link, Registration
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import retract, se3, twist_between
-from tofuse.engine.normal import SIGMA_OF_MEDIAN
+from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.engine.search import DISTINCT_M, DISTINCT_RAD
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.tracking import HANDHELD
@@ -131,8 +131,8 @@ def odometry_over(before: TrackedComponent, after: TrackedComponent) -> Link | N
     step_count = max(elapsed / max(float(np.median(np.concatenate(intervals))), 1e-9), 1.0)
     # Errors of odometry are in proportion to the motion.
     typical = np.median(np.concatenate(lengths)[valid], axis=0) * step_count
-    excess = np.maximum(se3.lengths(T[None])[0] / np.maximum(typical, 1e-9), 1.0)
-    step_sigma = SIGMA_OF_MEDIAN * np.median(np.abs(errors[valid]), axis=0)
+    excess = np.maximum(se3.lengths(T) / np.maximum(typical, 1e-9), 1.0)
+    step_sigma = np.median(np.abs(errors[valid]), axis=0) / MEDIAN_OF_NORMAL
     sigma = step_sigma * np.sqrt(step_count) * np.repeat(excess, 3)
     limit = np.repeat([CONVERGENCE * before.depth, CONVERGENCE], 3)
     if (sigma > limit).any():
@@ -315,7 +315,7 @@ class MergedComponents:
         i, j = np.array(edges).T
         motion = se3.inverse(T[i]) @ T[j]
         depth = np.array([self.depth_of(order[k]) for k in i])
-        lengths = np.linalg.norm(motion[:, :3, 3], axis=1) / depth + np.asarray(se3.angle(motion))
+        lengths = se3.change_of_view(motion, depth)
         graph = csr_array((lengths + 1e-9, (i, j)), shape=(len(order), len(order)))
         distances = dijkstra(graph, directed=False, indices=row[start])
         return {f: float(distances[k]) for f, k in row.items()}
@@ -342,15 +342,11 @@ class MergedComponents:
         return se3.is_within(difference, DISTINCT_M + drift * depth, DISTINCT_RAD + drift)
 
     def separation(self, a: MergedComponent, b: MergedComponent, link: Link, other: Link) -> float:
-        """Return the distance between the views of two links, on the side where it is larger.
-
-        Translation as a fraction of the depth plus rotation in rad.
-        """
+        """Return the change of view between those of two links, on the side where it is larger."""
         distances = []
         for merged, i, k in zip((a, b), self.ends(a, link), self.ends(a, other), strict=True):
             T = se3.inverse(self.T_merged(merged, i)) @ self.T_merged(merged, k)
-            distance_m = float(np.linalg.norm(T[:3, 3]))
-            distances.append(distance_m / self.depth_of(i) + float(se3.angle(T)))
+            distances.append(float(se3.change_of_view(T, self.depth_of(i))))
         return max(distances)
 
     def views_of(self, merged: MergedComponent) -> list[View]:

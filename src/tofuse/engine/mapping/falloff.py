@@ -19,18 +19,18 @@ unlike the cosine it is nearly free of noise.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.special import stdtrit
 
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64
-from tofuse.engine.compute import run_all
 from tofuse.engine.frames import Frame, RangeFrame, Recording
+from tofuse.engine.mapping.recorded_views import RecordedViews
 from tofuse.engine.mapping.trial import pooled
+from tofuse.engine.normal import robust_sigma
 from tofuse.engine.search import pair_agreement, verification
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view, residual_kernels
 
@@ -113,7 +113,16 @@ def estimate_falloff(
     law
         Law of the falloff of amplitude, or else of colour.
     """
-    views = _FalloffViews(recording, prepare, options)
+
+    def corrected(image: RangeFrame) -> RangeFrame | None:
+        frame = prepare(image)
+        return frame if isinstance(frame, RangeFrame) and len(frame) else None
+
+    def prepared(frame: RangeFrame) -> PreparedView | None:
+        view = prepare_view(frame, options)
+        return view if view.has_albedo else None
+
+    views = RecordedViews(recording, corrected, prepared)
     slopes: list[_Slope] = []
     starts = np.unique(np.linspace(0, len(recording) - 1, _PAIRS + 1)[:-1].astype(int))
     views.load([k for start in starts.tolist() for k in (start, start + _STRIDE)])
@@ -141,38 +150,9 @@ class _Slope:
     motion: float
 
 
-class _FalloffViews:
-    """Views of a recording, with uncompensated amplitude."""
-
-    def __init__(self, recording: Recording, prepare: Prepare, options: SurfaceOptions) -> None:
-        self._recording, self._prepare, self._options = recording, prepare, options
-        self._views: dict[int, PreparedView | None] = {}
-
-    def get(self, k: int) -> PreparedView | None:
-        """Return the k-th view; None if there is none, or it has no amplitude."""
-        self.load([k])
-        return self._views[k]
-
-    def load(self, positions: Sequence[int]) -> None:
-        """Prepare views in parallel; corrections may depend on the frames before."""
-        missing = [k for k in positions if k not in self._views]
-        frames = [self._corrected(k) for k in missing]
-        views = run_all([partial(self._prepared, frame) for frame in frames])
-        self._views.update(zip(missing, views, strict=True))
-
-    def _corrected(self, k: int) -> RangeFrame | None:
-        image = self._recording.image(k) if k < len(self._recording) else None
-        frame = None if image is None else self._prepare(image)
-        return frame if isinstance(frame, RangeFrame) and len(frame) else None
-
-    def _prepared(self, frame: RangeFrame | None) -> PreparedView | None:
-        if frame is None:
-            return None
-        view = prepare_view(frame, self._options)
-        return view if view.has_albedo else None
-
-
-def _slope_from(views: _FalloffViews, start: int, initial: float, law: Law) -> _Slope | None:
+def _slope_from(
+    views: RecordedViews[RangeFrame, PreparedView], start: int, initial: float, law: Law
+) -> _Slope | None:
     """Return the slope of a view and a later one with enough motion in between, if any."""
     target = views.get(start)
     if target is None:
@@ -276,5 +256,5 @@ def _slope(source: PreparedView, target: PreparedView, T: Float64, law: Law) -> 
         slope = float(x @ (y[inliers] - y[inliers].mean()) / squares)
         residual = y - slope * log_change
         residual -= np.median(residual[inliers])
-        inliers = np.abs(residual) < 3 * 1.48 * float(np.median(np.abs(residual[inliers]))) + 1e-9
+        inliers = np.abs(residual) < 3 * robust_sigma(residual[inliers]) + 1e-9
     return _Slope(slope, squares, motion)

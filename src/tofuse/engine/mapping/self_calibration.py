@@ -2,8 +2,8 @@
 
 Refined views show whether an error of the intrinsics or of the depth distorts the trajectory:
 with a correction, they support each other better, and the drift over a loop is smaller
-(`posegraph.calibration_check`). The recording is then reconstructed again with the correction,
-which is kept only if the error bound of the poses is smaller (`posegraph.accuracy`), although it
+(`refinement.calibration_check`). The recording is then reconstructed again with the correction,
+which is kept only if the error bound of the poses is smaller (`quality.pose_accuracy`), although it
 includes the uncertainty of the correction. If neither trajectory is bounded, views must fit better
 before refinement. And the correction must be stable: if a calibration error only happens to explain
 a drift, the corrected views yield an estimate that undoes much of the correction.

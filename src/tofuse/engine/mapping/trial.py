@@ -34,6 +34,7 @@ from tofuse.engine.arrays import Float32, Float64, Intp
 from tofuse.engine.compute import run_all
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.geometry import homogeneous, se3
+from tofuse.engine.mapping.recorded_views import RecordedViews
 from tofuse.engine.normal import robust_sigma
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
@@ -274,38 +275,21 @@ class _AlignedViews:
     """Views of a recording and alignments between them, cached."""
 
     def __init__(self, recording: Recording, uncorrected: Prepare, corrected: Prepare) -> None:
-        self._recording = recording
-        self._uncorrected, self._corrected = uncorrected, corrected
-        self._views: dict[int, _TrialView | None] = {}
+        def both(image: RangeFrame) -> tuple[RangeFrame, RangeFrame] | None:
+            before, after = uncorrected(image), corrected(image)
+            if not (isinstance(before, RangeFrame) and isinstance(after, RangeFrame)):
+                return None
+            return (before, after) if len(before) else None
+
+        self._count = len(recording)
+        self._views = RecordedViews(recording, both, lambda pair: _TrialView.of(*pair))
         self._steps: dict[tuple[int, int], projective.Aligned | None] = {}
-
-    def _view(self, k: int) -> _TrialView | None:
-        self._load([k])
-        return self._views[k]
-
-    def _load(self, positions: Sequence[int]) -> None:
-        """Prepare views in parallel; corrections may depend on the frames before."""
-        missing = [k for k in positions if k not in self._views]
-        frames = [self._corrected_pair(k) for k in missing]
-        views = run_all(
-            [partial(_TrialView.of, *both) if both else lambda: None for both in frames]
-        )
-        self._views.update(zip(missing, views, strict=True))
-
-    def _corrected_pair(self, k: int) -> tuple[RangeFrame, RangeFrame] | None:
-        frame = self._recording.image(k) if k < len(self._recording) else None
-        if frame is None:
-            return None
-        uncorrected, corrected = self._uncorrected(frame), self._corrected(frame)
-        if not (isinstance(uncorrected, RangeFrame) and isinstance(corrected, RangeFrame)):
-            return None
-        return (uncorrected, corrected) if len(uncorrected) else None
 
     def _step(self, i: int, j: int) -> projective.Aligned | None:
         """Align view j to view i; None if they do not fit."""
         if (i, j) not in self._steps:
-            self._load([i, j])
-            target, source = self._view(i), self._view(j)
+            self._views.load([i, j])
+            target, source = self._views.get(i), self._views.get(j)
             aligned = None
             if target is not None and source is not None:
                 inputs = source.surface, [projective.Target(target.surface)]
@@ -318,7 +302,7 @@ class _AlignedViews:
 
     def stride(self, start: int, stride: int) -> int:
         """Return the frames from one view to the next for the desired motion; iterative."""
-        max_stride = max(1, min(_MAX_STRIDE, (len(self._recording) - 1) // _VIEWS))
+        max_stride = max(1, min(_MAX_STRIDE, (self._count - 1) // _VIEWS))
         tried = set()
         while stride not in tried:
             tried.add(stride)
@@ -332,21 +316,20 @@ class _AlignedViews:
 
     def _relative_motion(self, k: int, step: projective.Aligned) -> float:
         """Return the motion relative to the desired one."""
-        view, T = self._view(k), step.T_world_source
+        view, T = self._views.get(k), step.T_world_source
         depth = 1.0 if view is None else view.surface.depth
-        distance = float(np.linalg.norm(T[:3, 3]))
-        return max(float(se3.angle(T)) / _DESIRED_ANGLE, distance / (_DESIRED_DISTANCE * depth))
+        return float((se3.lengths(T) / (_DESIRED_DISTANCE * depth, _DESIRED_ANGLE)).max())
 
     def run(self, start: int, stride: int) -> tuple[list[_TrialView], Float64]:
         """Return aligned views from `start` on, and their poses (N, 4, 4) relative to the first."""
         positions = range(start, start + (_VIEWS - 1) * stride, stride)
-        self._load([*positions, positions[-1] + stride])
-        first = self._view(start)
+        self._views.load([*positions, positions[-1] + stride])
+        first = self._views.get(start)
         if first is None:
             return [], np.zeros((0, 4, 4))
         views, poses = [first], [np.eye(4)]
         for k in positions:
-            step, view = self._step(k, k + stride), self._view(k + stride)
+            step, view = self._step(k, k + stride), self._views.get(k + stride)
             if step is None or view is None:
                 break
             views.append(view)
@@ -358,8 +341,10 @@ class _AlignedViews:
         sums = np.zeros(2)
         for k in range(start, start + (_VIEWS - 1) * stride, stride):
             step = self._steps.get((k, k + stride))
+            if step is None:
+                continue
             target, source = self._views.get(k), self._views.get(k + stride)
-            if step is None or target is None or source is None:
+            if target is None or source is None:
                 continue
             sides = (
                 (target.surface, source.uncorrected),

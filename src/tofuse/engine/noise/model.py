@@ -150,16 +150,10 @@ class NoiseModel(Bounded):
             return "confidence"
         return "range"
 
-    def sigma(self, frame: RangeFrame, incidence: Float32 | None = None) -> Float32:
+    def sigma(self, frame: RangeFrame) -> Float32:
         """Return the standard deviation (H, W) float32 in m of the radial range; 0 where invalid.
 
-        Parameters
-        ----------
-        frame
-            The image.
-        incidence
-            (H, W) cosine between normal and ray, NaN where unknown. By default from the frame's
-            normals; without either, perpendicular incidence is assumed.
+        Without normals, perpendicular incidence is assumed.
         """
         law = self.law(frame)
         channel: Float32 | None = None
@@ -169,7 +163,7 @@ class NoiseModel(Bounded):
             channel = frame.amplitude_image
         elif law == "confidence" and frame.confidence_image is not None:
             channel = frame.confidence_image.astype(np.float32)
-        cosine = incidence_cosine(frame) if incidence is None else np.asarray(incidence, np.float32)
+        cosine = incidence_cosine(frame)
         out = np.empty(frame.depth.shape, np.float32)
         channel_image = _NO_IMAGE if channel is None else np.asarray(channel, np.float32)
         cosine_image = _NO_IMAGE if cosine is None else cosine
@@ -185,14 +179,6 @@ class NoiseModel(Bounded):
 
         run_chunks(rows, len(out))
         return out
-
-    def sigma_z(self, frame: RangeFrame, incidence: Float32 | None = None) -> Float32:
-        """Return the standard deviation (H, W) float32 in m of the z depth; 0 where invalid.
-
-        The parameters are those of `sigma`.
-        """
-        sigma = self.sigma(frame, incidence)
-        return np.where(sigma > 0, sigma / ray_lengths(frame.camera), np.float32(0))
 
     def _parameters(self) -> Float64:
         law = self.amplitude or AmplitudeLaw(1.0, 0.0)

@@ -28,7 +28,7 @@ from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.compute import run_all
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.normal import MEDIAN_OF_NORMAL
+from tofuse.engine.normal import robust_sigma
 from tofuse.engine.search import ViewPoints, pair_agreement
 from tofuse.engine.views import PreparedView
 
@@ -209,10 +209,10 @@ def _noise_scale(views: Sequence[_SessionView]) -> float:
     # Neighbours share errors, so views up to a quarter of the session apart are compared too.
     steps = sorted({1, max(1, len(views) // 8), max(1, len(views) // 4)})
     pairs = [(views[k], views[k + s]) for s in steps for k in range(len(views) - s)]
-    r, sigma = _residuals([pairs[k] for k in evenly_spaced(np.arange(len(pairs)), _MAX_PAIRS)])
+    r, sigma = _residuals(evenly_spaced(pairs, _MAX_PAIRS))
     if not len(r):
         return 1.0
-    return max(float(np.quantile(r / sigma, 0.5)) / MEDIAN_OF_NORMAL, 1.0)
+    return max(robust_sigma(r / sigma), 1.0)
 
 
 def _misalignment(
@@ -220,11 +220,10 @@ def _misalignment(
 ) -> float:
     """The distance between surfaces of two sessions in excess of noise (one sigma), m."""
     facing = [(a, b) for a in first for b in second if _similar_direction(a, b)]
-    sampled = evenly_spaced(np.arange(len(facing)), 4 * _MAX_PAIRS)
-    r, sigma = _residuals([facing[k] for k in sampled])
+    r, sigma = _residuals(evenly_spaced(facing, 4 * _MAX_PAIRS))
     if not len(r):
         return 0.0
-    total = float(np.quantile(r, 0.5)) / MEDIAN_OF_NORMAL
+    total = robust_sigma(r)
     noise = scale * float(np.sqrt((sigma**2).mean()))
     return float(np.sqrt(max(total**2 - noise**2, 0.0)))
 

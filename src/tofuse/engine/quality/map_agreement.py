@@ -28,15 +28,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float32, Float64
-from tofuse.engine.cameras import Camera, Fisheye, Pinhole
+from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.compute import run_all
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import RangeFrame, Recording, evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.trajectory_errors import associate, finite_or_none
+from tofuse.engine.quality.trajectory_errors import finite_or_none
 from tofuse.engine.quality.view_agreement_kernels import (
     agreement_sums,
-    project_by_lens,
     transform_points,
 )
 from tofuse.engine.sensor import Corrector
@@ -190,32 +189,19 @@ class SurfaceImage:
         return int(np.count_nonzero(self.points[..., 2]))
 
     @cached_property
-    def lens_parameters(self) -> Float64 | None:
-        """Lens parameters of `project_by_lens` at this resolution; None without a lens model."""
-        camera = self.camera
-        if not isinstance(camera, Pinhole):
-            return None
-        model = 0 if type(camera) is Pinhole else 2 if isinstance(camera, Fisheye) else 1
-        names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        intrinsics = [getattr(camera, name) / self.step for name in ("fx", "fy", "cx", "cy")]
-        distortion = [getattr(camera, name, 0.0) for name in names]
-        return np.array([*intrinsics, *distortion, model, self.max_radius2], float)
-
-    @cached_property
     def max_radius2(self) -> float:
         """Maximum x^2 + y^2 at z = 1 in the field of view, with a margin."""
         return 1.1 * float(np.nanmax((_rays(self.camera) ** 2).sum(-1)))
 
     def pixels(self, points: Float64) -> Float64:
-        """Project points (N, 3) in the camera frame to pixels (N, 2) of this resolution."""
-        pixels = np.full((len(points), 2), np.nan)
-        if self.lens_parameters is not None:
-            project_by_lens(points, self.lens_parameters, pixels)
-            return pixels
+        """Project points (N, 3) in the camera frame to pixels (N, 2) of the camera."""
+        if isinstance(self.camera, Pinhole):
+            return self.camera.project(points)
         # Other cameras project slowly, so only points that can be in view are projected.
+        pixels = np.full((len(points), 2), np.nan)
         x, y, z = points.T
         in_view = (z > 0.05) & (x * x + y * y <= self.max_radius2 * z * z)
-        pixels[in_view] = self.camera.project(points[in_view]) / self.step
+        pixels[in_view] = self.camera.project(points[in_view])
         return pixels
 
 
@@ -281,8 +267,7 @@ def map_consistency(
     recording
         Range images.
     poses
-        (M, 4, 4) T_world_camera of the M frames of the recording, NaN where there is none; see
-        `poses_of_frames` for a trajectory with its own times.
+        (M, 4, 4) T_world_camera of the M frames of the recording, NaN where there is none.
     frames
         Maximum number of frames to use.
     correctors
@@ -324,32 +309,14 @@ def map_consistency(
     return consistency_of_images(images, T[used])
 
 
-def poses_of_frames(times: ArrayLike, pose_times: ArrayLike, poses: ArrayLike) -> Float64:
-    """Assign each pose to the frame nearest in time, if that is within 0.02 s.
-
-    Parameters
-    ----------
-    times
-        (M,) times of the frames, s.
-    pose_times, poses
-        (P,) s and (P, 4, 4).
-
-    Returns
-    -------
-    (M, 4, 4), NaN for frames without a pose.
-    """
-    frame_poses = np.full((np.size(times), 4, 4), np.nan)
-    frames, rows = associate(times, pose_times).T
-    frame_poses[frames] = np.asarray(poses, float)[rows]
-    return frame_poses
-
-
 def _compare(a: SurfaceImage, b: SurfaceImage, T_a_b: Float64) -> tuple[int, int, int, float]:
     """Compare b's points, in a's frame, with the pixels of a that they project to."""
     points = b.points.reshape(-1, 3)
     transformed = np.empty_like(points)
     transform_points(points, np.ascontiguousarray(T_a_b), transformed)
-    return agreement_sums(transformed, a.pixels(transformed), a.points, a.normals)
+    return agreement_sums(
+        transformed, a.pixels(transformed), a.points, a.normals, a.step, a.max_radius2
+    )
 
 
 def _rays(camera: Camera) -> Float64:

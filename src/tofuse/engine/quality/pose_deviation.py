@@ -1,6 +1,6 @@
 """Deviation of input poses from pairwise registrations, and its statistical significance.
 
-Pairs of views measure the motion between them (`posegraph.pair_measurements`), with far more pairs
+Pairs of views measure the motion between them (`pair_measurements`), with far more pairs
 than poses. A least squares fit gives the poses that agree best with all pairs, and its residuals
 the errors of registrations in this recording, relative to their stated covariances. The input poses
 are consistent if they agree with the pairs as well as correct ones would.
@@ -68,7 +68,7 @@ def measured_pairs(views: Sequence[PosedView[PreparedView]], poses: Float64) -> 
     Returns
     -------
     A graph of the frames with these poses, every edge with the covariance of its alignment
-    (`registration.uncertainty`). Degenerate directions of a pair have almost no information.
+    (`alignment.uncertainty`). Degenerate directions of a pair have almost no information.
     """
     pairs = _overlapping(views, poses)
     surfaces = [view.view for view in views]
@@ -202,7 +202,7 @@ def fitted(graph: PoseGraph, depth_m: float) -> Fit:
     Parameters
     ----------
     graph
-        Of two views or more, see `posegraph.pair_measurements`.
+        Of two views or more, see `pair_measurements`.
     depth_m
         Median depth of the views, m.
     """

@@ -100,7 +100,7 @@ def has_rival(
 
     (own,) = aligned([T_earlier_later], _FINE)
     pixel = float(np.nanmedian(np.abs(np.diff(later.rays[..., 0], axis=1))))
-    moved = np.linalg.norm(T_earlier_later[:3, 3]) / later.depth + se3.angle(T_earlier_later)
+    moved = se3.change_of_view(T_earlier_later, later.depth)
     equal = _EQUAL_IF_STILL if moved < _STILL * pixel else _EQUAL
     offsets = reach * np.outer(_DISTANCES, _DIRECTIONS).ravel()
     starts = [T_earlier_later @ se3.translation((d.real, d.imag, 0.0)) for d in offsets]

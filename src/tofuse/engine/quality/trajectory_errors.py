@@ -219,12 +219,10 @@ def align(estimate: ArrayLike, reference: ArrayLike, arm_m: float | None = None)
     centre_e, centre_r = T_e[:, :3, 3].mean(0), T_r[:, :3, 3].mean(0)
     cross_covariance = (T_r[:, :3, 3] - centre_r).T @ (T_e[:, :3, 3] - centre_e) / len(T_e)
     mean_rotation_matrix = (T_r[:, :3, :3] @ np.swapaxes(T_e[:, :3, :3], 1, 2)).mean(0)
-    T = np.eye(4)
     # The mean squared angle is half the mean squared difference of the matrices.
     weight = _ORIENTATION_WEIGHT if arm_m is None else arm_m**2 / 2
-    T[:3, :3] = se3.nearest_rotation(cross_covariance + weight * mean_rotation_matrix)
-    T[:3, 3] = centre_r - T[:3, :3] @ centre_e
-    return T
+    R = se3.nearest_rotation(cross_covariance + weight * mean_rotation_matrix)
+    return se3.pose(R, centre_r - R @ centre_e)
 
 
 def distances_between(estimate: Float64, reference: Float64) -> Float64:

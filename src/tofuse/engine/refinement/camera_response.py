@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr, stdtrit  # scipy.stats takes long to import
 
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.geometry import se3
@@ -178,7 +179,7 @@ class Linearised:
         # Reweighted least squares holds the weights constant, and their curvature exceeds that of
         # the cost. A single step with it falls short, and a sandwich estimate by it is too small
         # (Huber 1981, Robust Statistics, section 3.2: the mean of psi').
-        return cls(state, system, T_i_j, H, g, factor, tukey.consistency(options.robust))
+        return cls(state, system, T_i_j, H, g, factor, tukey.consistency(projective.ROBUST))
 
     def response_to_errors(self) -> Response:
         """Return the response to each error that all views share."""

@@ -117,7 +117,7 @@ class Refined:
     start
         (N, 4, 4) poses that the alignment started from.
     errors
-        (ERRORS,) of the camera, in the order of `kernels.pair_equations`; 0 where not estimated.
+        (ERRORS,) of the camera, in the order of `pair_equation_kernels`; 0 where not estimated.
     pairs
         (M, 2) positions of the overlapping views i < j.
     moved
@@ -205,7 +205,7 @@ def refine(
     options
         See `RefineOptions`.
     calibrate
-        Errors of the camera to estimate as well, by their number in `kernels.pair_equations`.
+        Errors of the camera to estimate as well, by their number in `pair_equation_kernels`.
     priors
         Measurements by other sensors.
     pairs

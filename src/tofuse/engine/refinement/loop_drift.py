@@ -266,7 +266,8 @@ def _closure_error(steps: Float64) -> Float64:
 
 
 def _norms(T: Float64) -> tuple[float, float]:
-    return float(np.linalg.norm(T[:3, 3])), float(se3.angle(T))
+    length, angle = se3.lengths(T).tolist()
+    return length, angle
 
 
 def longest_loop(pairs: Intp) -> tuple[int, int] | None:

@@ -629,7 +629,7 @@ def _gap(e: Evidence) -> Iterator[Reason]:
     ):
         a, b = min(i, j), max(i, j)
         gap = se3.inverse(measured) @ se3.inverse(e.sequential[i]) @ e.sequential[j]
-        distance, angle = float(np.linalg.norm(gap[:3, 3])), float(se3.angle(gap))
+        distance, angle = se3.lengths(gap).tolist()
         excess = max(
             distance / max(GAP_FLOOR_M, GAP_FRACTION * float(steps[a:b].sum())),
             angle / max(GAP_FLOOR_RAD, GAP_FRACTION * float(turns[a:b].sum())),

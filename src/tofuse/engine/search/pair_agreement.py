@@ -29,6 +29,11 @@ _NEIGHBOURS = np.ones((5, 5), np.uint8)
 _FALLOFF_SIGMA, _CORRELATED_POINTS, _ITERATIONS = 4.0, 100, 4
 
 
+# Weight of a point in free space, and maximum weight of one on a surface of another albedo, where
+# that of a supporting point is 1.
+_VIOLATION_WEIGHT, _CLASH_WEIGHT = 2.0, 1.0
+
+
 @dataclass(frozen=True)
 class AgreementOptions:
     """Options of the comparison of two images.
@@ -40,24 +45,16 @@ class AgreementOptions:
     sigmas, floor_m, floor_fraction
         Distance tolerance of a supporting point: standard deviations of both images, plus metres,
         plus a fraction of its depth, for systematic errors of the sensor.
-    max_angle
-        Largest angle between the normals of surfaces that support each other, rad.
     albedo
         Difference in log albedo, less the exposure, at which a point on the surface counts neither
         for nor against the pose; beyond twice this value it is a clash.
-    violation_weight, clash_weight
-        Weight of a point in free space, and maximum weight of one on a surface of another albedo,
-        relative to a supporting point.
     """
 
     points: int = 2500
     sigmas: float = 2.0
     floor_m: float = 0.01
     floor_fraction: float = 0.01
-    max_angle: float = 0.7
     albedo: float = 0.1
-    violation_weight: float = 2.0
-    clash_weight: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -193,9 +190,7 @@ class Comparison:
                 options.albedo
             )
             clash = int(np.count_nonzero(ratio > _CLASH_RATIO))
-            consistent -= float(
-                np.minimum(ratio**2, 1 + options.clash_weight).sum(dtype=np.float64)
-            )
+            consistent -= float(np.minimum(ratio**2, 1 + _CLASH_WEIGHT).sum(dtype=np.float64))
         per_point = 1 / max(count, 1)
         return Agreement(
             overlap=float(total[kernels.COMPARED] * per_point),
@@ -204,7 +199,7 @@ class Comparison:
             clash=float(clash * per_point),
             rms_m=float(np.sqrt(total[kernels.SQUARES_M] / on_surface)) if on_surface else np.inf,
             points=count,
-            score=float(per_point * (consistent - options.violation_weight * violation)),
+            score=float(per_point * (consistent - _VIOLATION_WEIGHT * violation)),
             falloff=falloff,
         )
 
@@ -266,7 +261,7 @@ def _one_direction(
         view.planes, view.plane_variance, view.albedo, target.nearest, grid.lookup, grid.frame
     )
     tolerance = kernels.Tolerance(
-        options.sigmas, options.floor_m, options.floor_fraction, float(np.cos(options.max_angle))
+        options.sigmas, options.floor_m, options.floor_fraction, projective.MIN_COSINE
     )
 
     def work(a: int, b: int) -> Float64:

@@ -180,12 +180,12 @@ class Search:
 
     def _refined(self, poses: Float64) -> list[Candidate]:
         """Refine poses (N, 4, 4) by two-way ICP and evaluate them."""
-        s, t, options = self.resampled_source, self.resampled_target, self.comparison.options
+        s, t = self.resampled_source, self.resampled_target
         poses = poses.copy()
-        floor = _noise_floor(s, t, options)
+        floor = _noise_floor(s, t, self.comparison.options)
         depth = 0.5 * (s.depth + t.depth)
         reaches = np.maximum(0.25 * depth * _REACH_DECAY, 3 * floor)
-        refine_poses(s, t, poses, reaches, _ICP_POINTS, options.max_angle)
+        refine_poses(s, t, poses, reaches, _ICP_POINTS)
         # Poses that converge to the same one are evaluated once.
         R, x = poses[:, :3, :3].copy(), poses[:, :3, 3].copy()
         evaluated = self._evaluated(poses[kernels.select_distinct(R, x, depth, floor, len(poses))])
@@ -193,7 +193,7 @@ class Search:
         best = sorted(evaluated, key=lambda candidate: -candidate.score)[:count]
         refined = np.stack([candidate.T_target_source for candidate in best])
         reaches = np.maximum(8 * floor * _REACH_DECAY, 1.3 * floor)
-        refine_poses(s, t, refined, reaches, _REFINEMENT_POINTS, options.max_angle)
+        refine_poses(s, t, refined, reaches, _REFINEMENT_POINTS)
         return evaluated + self._evaluated(refined)
 
     def _evaluated(self, poses: Sequence[Float64] | Float64) -> list[Candidate]:

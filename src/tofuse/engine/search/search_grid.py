@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import cv2
 import numpy as np
 
+from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute import run_chunks
@@ -280,9 +281,7 @@ def _non_maximum_suppression(
     R, x = R[order], x[order]
     depth = 0.5 * (scorer.source.depth + scorer.target.depth)
     chosen = kernels.select_distinct(R, x, depth, 1.5 * scorer.reach, count)
-    poses = np.tile(np.eye(4), (len(chosen), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = R[chosen], x[chosen]
-    return poses
+    return se3.pose(R[chosen], x[chosen])
 
 
 def refine_poses(
@@ -291,11 +290,10 @@ def refine_poses(
     poses: Float64,
     reaches: Float64,
     points: int,
-    max_angle: float,
 ) -> None:
-    """Refine poses (N, 4, 4) in place by two-way ICP, with normals within `max_angle`, rad."""
+    """Refine poses (N, 4, 4) in place by two-way ICP."""
     source, target = s.subset(points), t.subset(points)
-    cosine = float(np.cos(max_angle))
+    cosine = projective.MIN_COSINE
     depth = 0.5 * (s.depth + t.depth)
     run_chunks(
         lambda i, j: kernels.refine_poses(source, target, reaches, cosine, depth, poses, i, j),

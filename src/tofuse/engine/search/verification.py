@@ -17,7 +17,7 @@ import numpy as np
 
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64
-from tofuse.engine.normal import MEDIAN_OF_NORMAL
+from tofuse.engine.normal import robust_sigma
 from tofuse.engine.search.pair_agreement import AgreementOptions
 
 # Statistics of an alignment, all logarithms: odds of an outlier, odds of a point in free space, the
@@ -141,7 +141,7 @@ class FitStatistics:
             n = len(values)
             if n:
                 location = float(np.median(values))
-                spread = float(np.median(np.abs(values - location))) / MEDIAN_OF_NORMAL
+                spread = robust_sigma(values - location)
                 weight = n / (n + _PRIOR_COUNT)
                 mean[k] += weight * (location - mean[k])
                 sigma[k] = np.hypot(np.sqrt(weight) * spread, np.sqrt(1 - weight) * sigma[k])

@@ -62,7 +62,8 @@ class Correction(Protocol):
     Attributes
     ----------
     takes
-        Kinds of view it accepts: "range", "cloud". It may pass some of them through unchanged.
+        Kinds of view it accepts: "range", "cloud"; by default both. It may pass some of them
+        through unchanged.
     needs_fit
         Whether parameters are to be estimated from frames of the recording first.
     needs_trial
@@ -73,7 +74,7 @@ class Correction(Protocol):
     """
 
     part_kind: ClassVar[str] = "correction"
-    takes: ClassVar[frozenset[str]]
+    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     @property
     def needs_fit(self) -> bool:
@@ -82,7 +83,7 @@ class Correction(Protocol):
 
     @property
     def needs_trial(self) -> bool:
-        """Whether a trial on the recording (`pipeline.trial`) decides if it is used."""
+        """Whether a trial on the recording (`mapping.trial`) decides if it is used."""
         return False
 
     @property
@@ -148,8 +149,6 @@ class Noise(FrameCorrection):
     """
 
     model: NoiseModel | None = None
-
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def apply(self, frame: Frame, T_world_camera: Float64 | None = None) -> Frame:
         """See `Corrector.apply`."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -152,7 +152,6 @@ class CameraErrors(Bounded, Correction):
     center_x_sigma: Annotated[float, Bounds(0, 0.5)] = 0.0
     center_y_sigma: Annotated[float, Bounds(0, 0.5)] = 0.0
     distortion_sigma: Annotated[float, Bounds(0, 0.5)] = 0.0
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def start(self) -> Corrector:
         """See `Correction.start`."""

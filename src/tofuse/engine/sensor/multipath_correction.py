@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -65,8 +65,6 @@ class Multipath(Bounded, Correction):
     applied: bool = True
     strength: tuple[float, ...] | None = None
 
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
-
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.strength is not None and not (
@@ -90,7 +88,7 @@ class Multipath(Bounded, Correction):
         """See `Correction.after_trial`.
 
         The correction is not scaled by the strength, whose estimate is biased low
-        (`pipeline.trial`), while the gain has been estimated from the recording. Its standard error
+        (`mapping.trial`), while the gain has been estimated from the recording. Its standard error
         is added to `relative_sigma`.
         """
         if not np.isfinite([strength, error]).all():

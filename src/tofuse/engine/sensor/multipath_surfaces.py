@@ -36,7 +36,7 @@ _MAX_MISFIT = 0.006
 
 
 def block_nodes(z: Float32, rays: Float32, amplitude: Float32, step: int) -> Float64:
-    """Return the nodes (Hn, Wn, COLUMNS) of an image without planes, see `kernels.multipath`."""
+    """Return the nodes (Hn, Wn, COLUMNS) of an image without planes, see `multipath_kernels`."""
     size = -(-z.shape[0] // step), -(-z.shape[1] // step)
     nodes = np.empty((*size, COLUMNS))
     kernels.block_means(z, rays, amplitude, step, _JUMP, nodes)
@@ -146,7 +146,7 @@ def visible_sources(surfaces: Surfaces, radiosity: Complex128) -> Float32:
 
     Returns
     -------
-    Sources as in `kernels.multipath.add_irradiance`.
+    Sources as in `multipath_kernels.add_irradiance`.
     """
     out = np.empty((surfaces.has_plane.size, 9), np.float32)
     count = kernels.visible_sources(
@@ -165,7 +165,7 @@ class ReflectorMap:
 
     @property
     def patches(self) -> Float32:
-        """(N, PATCH) in the world frame, see `kernels.multipath.project_patches`."""
+        """(N, PATCH) in the world frame, see `multipath_kernels.project_patches`."""
         return self._patches
 
     def add(self, surfaces: Surfaces, static: Bool, T_world_camera: Float64) -> None:
@@ -260,7 +260,7 @@ class OffscreenCells:
             )
 
     def sources(self, surfaces: Surfaces, gain: float, wave_number: float) -> Float32:
-        """Return the light sources (S, 9) outside the image, as in `kernels.add_irradiance`.
+        """Return light sources (S, 9) outside the image, see `multipath_kernels.add_irradiance`.
 
         Cells without a mapped surface extrapolate the plane and albedo of the nearest node at the
         image's border.

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -194,8 +194,6 @@ class LensScattering(Bounded, FrameCorrection):
     fractions: tuple[float, ...] | None = None
     widths: Annotated[tuple[float, ...], NotEmpty()] = (0.04, 0.1, 0.3)
     period_m: Annotated[float | None, Bounds(0, exclusive=True)] = None
-
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Self
 
 import numpy as np
 import scipy  # loads its parts when they are used
@@ -389,8 +389,6 @@ class Unwrap(Bounded, FrameCorrection):
     white: Annotated[float | None, Bounds(0, exclusive=True)] = None
     period_m: Annotated[float | None, Bounds(0, exclusive=True)] = None
     options: UnwrapOptions = field(default_factory=UnwrapOptions)
-
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     @property
     def needs_fit(self) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -44,8 +44,6 @@ class Wrapped(Bounded, Filter):
     """
 
     min_albedo: Annotated[float, Bounds(0, 1)] = 0.02
-
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from tofuse.engine.alignment import projective
 from tofuse.engine.alignment import step_kernels as steps
 from tofuse.engine.arrays import Float64, Int64, Intp
 from tofuse.engine.cameras import lens
@@ -40,7 +41,7 @@ _USUAL_SCALES = 0.0, 1.0, 0.1
 
 @dataclass(frozen=True)
 class Round:
-    """Iterations with the same noise inflation: as in `registration.projective.Level`."""
+    """Iterations with the same noise inflation: as in `projective.Level`."""
 
     iterations: int
     inflation_m: float
@@ -62,7 +63,7 @@ class RefineOptions:
         Largest number of earlier partners of each view, spread evenly over those that overlap.
     points
         Approximate number of points of each view.
-    robust, max_angle, photometric, max_sigma_m
+    photometric
         As in `ProjectiveOptions`.
     convergence
         Iterations end when no view moves by more, in units of 1 cm and 1 degree, and no error of
@@ -80,10 +81,7 @@ class RefineOptions:
     overlap: float = 0.3
     neighbours: int = 10
     points: int = 1500
-    robust: float = 3.5
-    max_angle: float = 0.7
     photometric: bool = True
-    max_sigma_m: float = 0.02
     convergence: float = 0.02
     error_convergence: float = 0.0
     shared: float = 1.0
@@ -107,7 +105,7 @@ class DirectedPairs:
     sources
         Points of all views.
     rows
-        (P, SIZE) sums of each pair, in the order of `kernels.pair_equations`.
+        (P, SIZE) sums of each pair, in the order of `pair_equation_kernels`.
     sums
         (P, PATCHES, PATCH_SIZE) the same sums for each patch of the target; empty unless needed.
     """
@@ -134,7 +132,7 @@ class DirectedPairs:
     ) -> DirectedPairs:
         """Return both directions of each pair (M, 2), with `scales` of `KnownScales.of`, if any."""
         target, source = _both_directions(pairs)
-        max_scale = np.maximum(3.0, options.max_sigma_m / np.array([v.sigma for v in views]))
+        max_scale = np.maximum(3.0, projective.MAX_SIGMA_M / np.array([v.sigma for v in views]))
         scales = np.tile(_USUAL_SCALES, (len(target), 1)) if scales is None else scales
         exposure, scale_g, scale_p = scales.T.copy()
         photometric = np.array([v.has_albedo for v in views]) & options.photometric
@@ -191,14 +189,13 @@ class DirectedPairs:
         by_patch
             Whether to sum over patches as well, for `discount_shared`.
         """
-        views, options = self.views, self.options
+        views = self.views
         order, targets, ends = by_target(self.target)
         target, source = self.target[order], self.source[order]
         exposure, scale_g, scale_p = (column[order] for column in self._scales())
         T_target_source = se3.inverse(poses[target]) @ poses[source]
         rows = np.empty((len(target), kernels.SIZE))
         sums = np.empty((len(rows), shared_error.PATCHES if by_patch else 0, kernels.PATCH_SIZE))
-        cosine = float(np.cos(options.max_angle))
 
         def work(a: int, b: int) -> None:
             for first in range(a, b, kernels.TARGETS):
@@ -222,8 +219,8 @@ class DirectedPairs:
                         scale_g[pairs],
                         scale_p[pairs],
                         stage.inflation_m,
-                        options.robust,
-                        cosine,
+                        projective.ROBUST,
+                        projective.MIN_COSINE,
                     ),
                     errors,
                     fixed_errors,
@@ -302,7 +299,7 @@ class DirectedPairs:
         self.scale_g[enough] = np.clip(distance_scale, 0.7, self.max_scale)[enough]
         weight = self.rows[:, kernels.WEIGHT_P]
         mean_square = self.rows[:, kernels.SQUARES_P] / np.maximum(weight, 1e-9)
-        albedo_scale = np.sqrt(mean_square / tukey.consistency(self.options.robust))
+        albedo_scale = np.sqrt(mean_square / tukey.consistency(projective.ROBUST))
         used = (weight > 0) & (self.scale_p > 0)
         scale = np.clip(np.hypot(albedo_scale, stage.photometric_inflation), 0.005, 0.5)
         self.scale_p[used] = scale[used]

@@ -88,9 +88,9 @@ def disagreement(sums: Float64, rows: Float64, correlation: Float64) -> Disagree
     Parameters
     ----------
     sums
-        (P, PATCHES, PATCH_SIZE) of `kernels.pair_equations.target_equations`.
+        (P, PATCHES, PATCH_SIZE) of `pair_equation_kernels.target_equations`.
     rows
-        (P, SIZE) normal equations of the pairs, see `kernels.pair_equations`.
+        (P, SIZE) normal equations of the pairs, see `pair_equation_kernels`.
     correlation
         (PATCHES, PATCHES) of the errors.
     """

@@ -222,6 +222,11 @@ class Spacing:
     max_stretch: float = 4.0
     views_per_place: int = 16
 
+    def is_exceeded(self, motion: Float64, depth: float, stretch: float) -> bool:
+        """Whether a motion (4, 4) at this depth, m, is larger than `stretch` times the required."""
+        reach = stretch * self.distance * depth
+        return not se3.is_within(motion, reach, stretch * self.angle)
+
     def places(self) -> PlaceCounts:
         """Return counts of the places that are as wide as the largest required motion."""
         return PlaceCounts(
@@ -375,10 +380,7 @@ class ViewStore(Generic[V]):
             self._last = T_component_camera, component
             return True
         motion = se3.inverse(last[0]) @ T_component_camera
-        if (
-            se3.angle(motion) < s.angle * self._stretch
-            and np.linalg.norm(motion[:3, 3]) < s.distance * self._stretch * view.depth
-        ):
+        if not s.is_exceeded(motion, view.depth, self._stretch):
             return False
         self._last = T_component_camera, component
         max_stretch = 2 * self._stretch > s.max_stretch

@@ -117,8 +117,8 @@ class Odometry(Protocol):
 
     @property
     def takes(self) -> frozenset[str]:
-        """Kinds of view it works on: "range", "cloud"."""
-        ...
+        """Kinds of view it works on: "range", "cloud"; by default both."""
+        return frozenset({"range", "cloud"})
 
     def start(self, seed: int, search: SearchOptions | None = None) -> Tracker:
         """Return a tracker for a new recording.

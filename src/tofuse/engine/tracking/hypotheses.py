@@ -474,13 +474,12 @@ def _background_depth(view: PreparedView) -> float:
 
 def _rotation_candidates(view: PreparedView) -> list[Float64]:
     """Return motions (4, 4) to try: none, and rotations about the camera and the scene."""
-    centre = np.eye(4)
-    centre[2, 3] = view.depth
+    centre = (0.0, 0.0, view.depth)
     motions = [np.eye(4)]
     for angle in np.radians([-12, -6, 6, 12]):
         for axis in (3, 4):
             twist = np.zeros(6)
             twist[axis] = angle
             rotation = se3.exp(twist)
-            motions += [rotation, centre @ rotation @ se3.inverse(centre)]
+            motions += [rotation, se3.about(centre, rotation)]
     return motions

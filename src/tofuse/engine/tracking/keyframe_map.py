@@ -108,9 +108,7 @@ class KeyframeMap:
         T_component_keyframes = np.stack([k.T_component_camera for k in self._keyframes])
         T_camera_keyframes = se3.inverse(T_component_camera) @ T_component_keyframes
         depth = np.array([k.depth for k in self._keyframes])
-        distances = np.linalg.norm(T_camera_keyframes[:, :3, 3], axis=1) / depth + np.asarray(
-            se3.angle(T_camera_keyframes)
-        )
+        distances = se3.change_of_view(T_camera_keyframes, depth)
         return self._keyframes[
             -1 if distances[-1] < verification.MAX_OVERLAP_DISTANCE else int(np.argmin(distances))
         ]

@@ -35,7 +35,7 @@ class Keyframes(Bounded, Odometry):
 
     A frame far from the keyframe becomes the next one. Degenerate directions follow the motion
     model, and are reported. An alignment is compared with how views of this camera usually fit
-    (`registration.verification`): one that fits worse must beat its rivals, and gets a wide
+    (`search.verification`): one that fits worse must beat its rivals, and gets a wide
     covariance. A frame that can't be connected begins a new component, in a coordinate frame of
     its own.
 

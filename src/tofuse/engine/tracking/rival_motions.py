@@ -222,7 +222,7 @@ def _shift(view: PreparedView, T: Float64) -> float:
     """Return by how many cells a motion (4, 4) moves the view."""
     width = float(view.rays[0, -1, 0] - view.rays[0, 0, 0])
     cell = abs(width) * stride_of(view) / view.z.shape[1]
-    return float((np.linalg.norm(T[:3, 3]) / view.depth + se3.angle(T)) / cell)
+    return float(se3.change_of_view(T, view.depth) / cell)
 
 
 def likelihood_ratios(

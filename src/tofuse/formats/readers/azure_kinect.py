@@ -85,10 +85,6 @@ class KinectLens(Rational):
             radius = np.hypot(points[..., 0], points[..., 1]) / points[..., 2]
         return np.where((radius <= self.metric_radius)[..., None], uv, np.nan)
 
-    def _distort(self, xy: Float64) -> Float64:
-        product = (xy[..., :1] * xy[..., 1:]) * (self.tangential_factor - 2.0)
-        return super()._distort(xy) + product * (self.p1, self.p2)
-
 
 @lru_cache(maxsize=8)
 def depth_camera(lens: KinectLens) -> Camera:

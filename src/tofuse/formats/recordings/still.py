@@ -19,7 +19,7 @@ from tofuse.engine.arrays import Bool, Float32, Float64, Intp, UInt8
 from tofuse.engine.cameras import Camera, RayTable
 from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame, Recording
 from tofuse.engine.noise import NoiseModel, noise_model_for
-from tofuse.engine.normal import MEDIAN_OF_NORMAL
+from tofuse.engine.normal import robust_sigma
 
 # Below these fractions of a pixel's noise, and of the blocks, nothing has moved.
 _COHERENT = 0.15
@@ -97,7 +97,7 @@ def _coherence(change: NDArray[Any], valid: Bool) -> ImageChange:
     values = np.abs(change[valid])
     if not values.any():
         return ImageChange(0.0, 0.0, identical=True)
-    scale = float(np.median(values)) / MEDIAN_OF_NORMAL
+    scale = robust_sigma(values)
     limit = 2.5 * scale if scale > 0 else float(values.max())
     clipped = np.where(valid, np.clip(change, -limit, limit), 0).astype(float)
     noise = float(np.sqrt((clipped[valid] ** 2).mean()))
@@ -247,9 +247,7 @@ def average_of(frames: Sequence[RangeFrame], model: NoiseModel) -> RangeFrame:
     centre = _median(depth, valid, count)
     residual = np.abs(depth - centre)
     # Scale of the actual noise relative to the model, so that inliers are not rejected.
-    scale = (
-        float(np.median(residual[valid] / sigma[valid])) / MEDIAN_OF_NORMAL if valid.any() else 1.0
-    )
+    scale = robust_sigma(residual[valid] / sigma[valid]) if valid.any() else 1.0
     inlier = valid & (residual <= _OUTLIER_SIGMAS * max(scale, 1.0) * sigma)
     inlier_count = inlier.sum(0)
     enough = (2 * count >= len(frames)) & (inlier_count > 0)

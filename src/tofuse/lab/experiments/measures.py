@@ -100,15 +100,15 @@ def circle_radius_m(positions: Float64) -> float:
     return float(np.sqrt(c + a * a + b * b))
 
 
-def extent_m(points: Float64, outer: float = 1.0) -> Float64:
-    """(3,) size of a model along its axes, without `outer` percent of the points at each end."""
-    low, high = np.percentile(points, [outer, 100 - outer], axis=0)
+def extent_m(points: Float64) -> Float64:
+    """(3,) size of a model along its axes, without one percent of the points at each end."""
+    low, high = np.percentile(points, [1, 99], axis=0)
     return high - low
 
 
-def surface_error_m(points: Float64, surface: Any, max_points: int = 10_000) -> float:
+def surface_error_m(points: Float64, surface: Any) -> float:
     """Median distance of a model's points from those of a tree of the true surface, m."""
-    sample = points[:: -(-len(points) // max_points)]
+    sample = points[:: -(-len(points) // 10_000)]
     return float(np.median(surface.query(sample)[0]))
 
 

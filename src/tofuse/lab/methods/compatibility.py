@@ -9,6 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.geometry import se3
 from tofuse.engine.icp import icp_kernels, interfaces
 from tofuse.engine.parts import part
 from tofuse.lab.methods.neighbourhoods import mean_curvature
@@ -33,8 +34,7 @@ class NormalCompatibility(Bounded, interfaces.Rejector):
         self, matches: interfaces.Matches, alignment: interfaces.Alignment
     ) -> interfaces.Matches:
         """See `Rejector.reject`."""
-        rotation = np.eye(4)
-        rotation[:3, :3] = alignment.T_target_source[:3, :3]
+        rotation = se3.pose(alignment.T_target_source[:3, :3])
         a = icp_kernels.transform_points(rotation, alignment.source.normals[matches.source])
         b = alignment.target.normals[matches.target]
         return matches.keep((a * b).sum(1) >= math.cos(self.max_angle_rad))

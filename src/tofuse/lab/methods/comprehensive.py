@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import heapq
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -26,8 +25,6 @@ class Comprehensive(interfaces.Matcher):
     deletes its row and its column, and repeats. A kd-tree gives the same pairs without the matrix:
     each source point proposes its nearest free target point, and the shortest proposal is accepted.
     """
-
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def prepare(self, target: interfaces.Points) -> interfaces.Search:
         """Build the tree, once for all iterations."""

@@ -11,7 +11,7 @@ from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import RangeFrame
-from tofuse.engine.geometry import KdTree
+from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.icp import icp_kernels, interfaces
 from tofuse.engine.parts import part
 from tofuse.lab.methods.cloud_search_kernels import grid_search
@@ -40,7 +40,6 @@ class NormalShooting(Bounded, interfaces.Matcher):
     """
 
     steps: Annotated[int, Bounds(1)] = 3
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def prepare(self, target: interfaces.Points) -> interfaces.Search:
         """Build the tree, once for all iterations."""
@@ -54,8 +53,7 @@ class _NormalSearch:
 
     def match(self, alignment: interfaces.Alignment, reach: float) -> interfaces.Matches:
         start, target = alignment.transformed, alignment.target
-        rotation = np.eye(4)
-        rotation[:3, :3] = alignment.T_target_source[:3, :3]
+        rotation = se3.pose(alignment.T_target_source[:3, :3])
         directions = icp_kernels.transform_points(rotation, alignment.source.normals)
         intersection = start
         index, _ = self.tree.nearest(intersection, reach)
@@ -159,7 +157,6 @@ class ClosestCompatible(Bounded, interfaces.Matcher):
     """
 
     ratio: Annotated[float, Bounds(1, exclusive=True)] = 1.2
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def prepare(self, target: interfaces.Points) -> interfaces.Search:
         """Build the tree, once for all iterations."""
@@ -213,7 +210,6 @@ class ClosestInvariant(Bounded, interfaces.Matcher):
     features: Annotated[tuple[Invariant, ...], NotEmpty()] = ("moments",)
     weight: Annotated[float, Bounds(0, exclusive=True)] = 20.0
     radius: Annotated[float, Bounds(0, exclusive=True)] = 6.0
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def prepare(self, target: interfaces.Points) -> interfaces.Search:
         """Build the tree, once for all iterations."""

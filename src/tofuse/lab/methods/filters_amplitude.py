@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -28,8 +27,6 @@ class Amplitude(Interval, Filter):
     maximum
         Highest amplitude that is kept; None for no limit below saturation.
     """
-
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""

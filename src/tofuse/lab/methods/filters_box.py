@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -32,8 +32,6 @@ class Box(Bounded, Filter):
     lower: tuple[float, float, float]
     upper: tuple[float, float, float]
     remove: Literal["outside", "inside"] = "outside"
-
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -30,8 +30,6 @@ class NeighbourDistance(Bounded, Filter):
 
     threshold: Annotated[float, Bounds(0, exclusive=True)] = 0.05
     k: Annotated[int, Bounds(1, MAX_NEIGHBOURS)] = 3
-
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`."""

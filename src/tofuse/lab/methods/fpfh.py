@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -55,7 +55,6 @@ class Fpfh(Bounded, Registrar):
     inliers: int = 6
     seeds: int = 100
     refine: bool = True
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -90,7 +90,6 @@ class Kiss(Bounded, Odometry):
     voxel: Annotated[float | None, Bounds(0, exclusive=True)] = None
     max_iterations: int = 500
     minimum_points: Annotated[int, Bounds(3)] = 10
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def start(self, seed: int, search: SearchOptions | None = None) -> Tracker:
         """See `Odometry.start`; deterministic."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -94,7 +94,6 @@ class LeastSquaresMatching(Bounded, Registrar):
     scale_sigma: Annotated[float, Bounds(0)] = 0.0
     intensity: Annotated[float, Bounds(0)] = 0.0
     max_iterations: Annotated[int, Bounds(1)] = 50
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def register(
         self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
@@ -227,10 +226,7 @@ class LeastSquaresMatching(Bounded, Registrar):
 
 def _information_in_source(N: Float64, T_target_source: Float64, centroid: Float64) -> Float64:
     """Convert information (6, 6) about `centroid`, in the target's axes, to `Registration`'s."""
-    rotation, translation = np.zeros((6, 6)), np.eye(4)
-    rotation[:3, :3] = rotation[3:, 3:] = T_target_source[:3, :3]
-    translation[:3, 3] = -centroid
-    J = rotation @ se3.adjoint(translation)
+    J = se3.adjoint(se3.pose(T_target_source[:3, :3]) @ se3.translation(-centroid))
     H = J.T @ N @ J
     return np.asarray((H + H.T) / 2)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -73,7 +73,6 @@ class Ndt(Bounded, Registrar):
     coarsest: Annotated[float, Bounds(0, exclusive=True)] = 40.0
     finest: Annotated[float, Bounds(0, exclusive=True)] = 5.0
     max_iterations: int = 30
-    takes: ClassVar[frozenset[str]] = frozenset({"range", "cloud"})
 
     def __post_init__(self) -> None:
         super().__post_init__()

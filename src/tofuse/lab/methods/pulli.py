@@ -120,10 +120,8 @@ def _align_view(k: int, poses: Float64, constraints: Sequence[Pairs]) -> Float64
         ]
     )
     a, b = own_points.mean(0), other_points.mean(0)
-    T = np.eye(4)
-    T[:3, :3] = se3.nearest_rotation((other_points - b).T @ (own_points - a))
-    T[:3, 3] = b - T[:3, :3] @ a
-    return T
+    R = se3.nearest_rotation((other_points - b).T @ (own_points - a))
+    return se3.pose(R, b - R @ a)
 
 
 def _displacement(k: int, before: Float64, after: Float64, constraints: Sequence[Pairs]) -> float:

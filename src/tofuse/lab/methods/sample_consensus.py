@@ -2,7 +2,7 @@
 
 RANSAC (Fischler and Bolles 1981; section 2.5.2 of the thesis) draws random triples until one of
 them is free of outliers with the required confidence. With few inliers, such as one in fifty, that
-takes too many samples (`registration.consensus` takes sets of compatible pairs instead).
+takes too many samples (`clouds.robust_motion` takes sets of compatible pairs instead).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tofuse.engine.alignment import Registration, projective
 from tofuse.engine.arrays import Bool, Float64, Int64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.clouds import robust_motion
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, unit_vectors
 
 Method = Literal["samples", "compatible"]
 
@@ -73,7 +73,7 @@ def weakly_constrained_directions(information: Float64) -> Float64:
     """Return the unit directions (k, 6) whose sigma exceeds 1 cm or 1 degree."""
     values, vectors = np.linalg.eigh(information * projective.UNITS[:, None] * projective.UNITS)
     weak = vectors[:, values < 1].T * projective.UNITS
-    return np.asarray(weak / np.linalg.norm(weak, axis=1, keepdims=True), np.float64)
+    return unit_vectors(weak)
 
 
 def registration_of(

@@ -82,9 +82,7 @@ def solve_correspondences(
         errors.append(error)
         if len(errors) > 1 and errors[-2] - errors[-1] <= _MIN_RELATIVE_DECREASE * abs(errors[-1]):
             break
-    out = np.tile(np.eye(4), (n, 1, 1))
-    out[:, :3, :3] = R
-    out[:, :3, 3] = -laplacian_inverse @ np.einsum("kab,ikb->ia", R, first_moment)
+    out = se3.pose(R, -laplacian_inverse @ np.einsum("kab,ikb->ia", R, first_moment))
     # Gauge freedom of the connected views: the first one is fixed.
     component = connected_components(laplacian != 0, directed=False)[1]
     anchor = np.unique(component, return_index=True)[1][component]

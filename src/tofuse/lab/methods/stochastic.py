@@ -90,9 +90,7 @@ class _Descent:
             translation = self.R[i] @ Z[:3, 3] + self.t[i] - self.t[j]
             self.t[steps] += gain[0] * fractions[:, :1] * translation
             self.t[j + 1 :] += gain[0] * translation
-        poses = np.tile(np.eye(4), (len(self.t), 1, 1))
-        poses[:, :3, :3], poses[:, :3, 3] = self.R, self.t
-        return np.asarray(se3.orthonormalise(poses))
+        return se3.pose(se3.nearest_rotation(self.R), self.t)
 
     def _rotate(self, steps: slice, rotations: Float64) -> Float64:
         """Rotate poses by world vectors (k, 3), and steps with them; returns the last rotation."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, unit_vectors
 from tofuse.engine.icp import icp_kernels, interfaces, surface_metrics
 from tofuse.engine.parts import part
 
@@ -46,20 +46,14 @@ class Symmetric(surface_metrics.SurfaceMetric):
         x = surface_metrics.solve(H, g, 2 * pairs.size)
         tangent = float(np.linalg.norm(x[3:]))
         angle = math.atan(tangent)
-        half = np.eye(4)
-        if tangent > 0:
-            half[:3, :3] = se3.so3_exp(x[3:] * (angle / tangent))
-        translation, T_centre, T_uncentre = np.eye(4), np.eye(4), np.eye(4)
-        translation[:3, 3] = x[:3] * math.cos(angle)
-        T_centre[:3, 3] = pairs.centre + centre
-        T_uncentre[:3, 3] = -T_centre[:3, 3]
+        half = se3.pose(se3.so3_exp(x[3:] * (angle / tangent if tangent > 0 else 0.0)))
+        motion = half @ se3.translation(x[:3] * math.cos(angle)) @ half
         T = pairs.T_target_source
-        return T @ T_centre @ half @ translation @ half @ T_uncentre @ se3.inverse(T)
+        return T @ se3.about(pairs.centre + centre, motion) @ se3.inverse(T)
 
     def fit(self, pairs: surface_metrics.SurfacePairs) -> tuple[Float64, float]:
         """See `SurfaceMetric.fit`: along the mean normal."""
-        n = pairs.source_normals + pairs.target_normals
-        n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
+        n = unit_vectors(pairs.source_normals + pairs.target_normals)
         r = (pairs.residual * n).sum(1)
         weight = pairs.weight * surface_metrics.loss_weights(self.loss, r, pairs.resolution)
         H, _, square = icp_kernels.plane_sums(pairs.points, n, n, r, weight)

@@ -173,11 +173,6 @@ class Tricp(Bounded, Registrar):
     tolerance: Annotated[float, Bounds(0, exclusive=True)] = 0.02
     max_iterations: int = 100
 
-    @property
-    def takes(self) -> frozenset[str]:
-        """Kinds of view it accepts: all."""
-        return frozenset({"range", "cloud"})
-
     def parts(self, overlap: float) -> Icp:
         """Return the trimmed ICP for one overlap."""
         return Icp(

@@ -60,9 +60,8 @@ _WALK = [
 
 def T_flat_room(room: int) -> Float64:
     """(4, 4) pose of a room's frame, whose origin is the middle of its floor."""
-    corner = np.eye(4)
-    corner[:2, 3] = -(HALF + WALL / 2)
-    return paths.rotation([0, 0, room * np.pi / 2]) @ corner
+    to_corner = -(HALF + WALL / 2)
+    return paths.rotation([0, 0, room * np.pi / 2]) @ se3.translation((to_corner, to_corner, 0))
 
 
 def plan(options: SceneOptions) -> ScenePlan:

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from tofuse.engine.arrays import Float64
+from tofuse.engine.geometry import se3
 from tofuse.lab.scenes.composition import Assembly
 from tofuse.lab.world import Material, Mesh
 from tofuse.lab.world import mesh as meshes
@@ -182,14 +183,14 @@ def leaf(length: float, width: float, droop: float) -> Mesh:
     return meshes.grid(points)
 
 
-def plant(assembly: Assembly, rng: np.random.Generator, leaves: int = 34) -> None:
+def plant(assembly: Assembly, rng: np.random.Generator) -> None:
     """Add a potted plastic plant, 1.1 m high: stems that fan out, with broad leaves."""
     pot = [(0, 0), (0.12, 0), (0.165, 0.27), (0.175, 0.27), (0.175, 0.30), (0.155, 0.30)]
     assembly.add(POT, meshes.lathe([*pot, (0.15, 0.26)], 28))
     assembly.add(SOIL, meshes.lathe([(0.152, 0.262), (0, 0.275)], 20))
     stems: list[Mesh] = []
     foliage: list[Mesh] = []
-    golden = np.pi * (3 - np.sqrt(5))
+    golden, leaves = np.pi * (3 - np.sqrt(5)), 34
     for k in range(leaves):
         fraction = (k + 0.5) / leaves
         azimuth = golden * k + rng.uniform(-0.3, 0.3)
@@ -202,12 +203,10 @@ def plant(assembly: Assembly, rng: np.random.Generator, leaves: int = 34) -> Non
         blade = leaf(rng.uniform(0.20, 0.28), rng.uniform(0.09, 0.13), rng.uniform(0.3, 0.9))
         pitch = rng.uniform(0.1, 0.7) + 0.3 * fraction
         c, s = np.cos(pitch), np.sin(pitch)
-        pose = np.eye(4)
         across = np.cross([0.0, 0.0, 1.0], out)
         forward = c * out + [0, 0, s]
-        pose[:3, :3] = np.stack([forward, across, np.cross(forward, across)], 1)
-        pose[:3, 3] = tip
-        foliage.append(blade.transformed(pose))
+        axes = np.stack([forward, across, np.cross(forward, across)], 1)
+        foliage.append(blade.transformed(se3.pose(axes, tip)))
     stems.append(meshes.rod((0, 0, 0.25), (0, 0, 0.72), 0.014, 0.008, 8))
     assembly.add(STEM, *stems)
     assembly.add(LEAF, *foliage)

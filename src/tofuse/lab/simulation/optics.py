@@ -12,7 +12,7 @@ from scipy.constants import speed_of_light
 from tofuse.engine.arrays import Bool, Float64, Int32
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.compute import run_chunks
-from tofuse.engine.geometry import unit_rays
+from tofuse.engine.geometry import unit_rays, unit_vectors
 from tofuse.lab.simulation import phasor_kernels as phasor
 from tofuse.lab.simulation.models import CameraModel
 from tofuse.lab.world import Scene
@@ -206,7 +206,7 @@ def direct_irradiance(
 
 
 def pixel_phasors(grid: RayGrid, returns: Returns, frequency: float) -> Float64:
-    """Direct light in each pixel, (H, W, 7) in the channels of `lab.kernels.phasor`."""
+    """Direct light in each pixel, (H, W, 7) in the channels of `phasor_kernels`."""
     return _pool(grid, returns.strength, returns.path, frequency)
 
 
@@ -271,7 +271,7 @@ def single_bounce_light(
 
     Returns
     -------
-    For each frequency (H, W, 7) in the channels of `lab.kernels.phasor`.
+    For each frequency (H, W, 7) in the channels of `phasor_kernels`.
     """
     step = max(4, points.shape[1] // 44)
     samples = (slice(step // 2, None, step), slice(step // 2, None, step))
@@ -360,8 +360,7 @@ def _hemisphere(count: int) -> Float64:
 def _frames(normals: Float64) -> Float64:
     """Orthonormal frames (N, 3, 3) of normals (N, 3): rows are two tangents and the normal."""
     helper = np.where(np.abs(normals[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
-    first = np.cross(helper, normals)
-    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
+    first = unit_vectors(np.cross(helper, normals))
     return np.stack([first, np.cross(normals, first), normals], 1)
 
 

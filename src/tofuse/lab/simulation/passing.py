@@ -26,8 +26,7 @@ Kind = Literal["person", "box"]
 CARTON = Material("carton", 0.45, 0.25, "print", (0.2, 0.2, 0.2))
 
 # Pose between passes.
-_T_HIDDEN = np.eye(4)
-_T_HIDDEN[2, 3] = -100.0
+_T_HIDDEN = se3.translation((0, 0, -100.0))
 _MIN_DISTANCE_M = 0.6
 # Max distance relative to that of the background.
 _BACKGROUND_RATIO = 0.75
@@ -88,9 +87,7 @@ class _Part:
     def T_body_part(self, t: float) -> Float64:
         """(4, 4) pose in the body's frame at time t in s of its gait."""
         angle = self.swing * _LIMB_RAD * np.sin(2 * np.pi * _GAIT_HZ * t)
-        T = paths.rotation([0, angle, 0])
-        T[:3, 3] = self.joint
-        return T
+        return se3.pose(se3.so3_exp([0, angle, 0]), self.joint)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.frames import CloudFrame
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, unit_vectors
 
 CAMERAS = 20
 RADIUS_M = 10.0
@@ -43,8 +43,7 @@ def peaks_normals() -> Float64:
     step = 1e-5
     slope_x = (peaks(x + step, y) - peaks(x - step, y)) / (2 * step)
     slope_y = (peaks(x, y + step) - peaks(x, y - step)) / (2 * step)
-    normals = np.stack([-slope_x, np.ones_like(x), -slope_y], -1)
-    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return unit_vectors(np.stack([-slope_x, np.ones_like(x), -slope_y], -1))
 
 
 def peaks_cameras() -> Float64:
@@ -56,12 +55,8 @@ def peaks_cameras() -> Float64:
     a = 2 * np.pi * np.arange(CAMERAS) / CAMERAS
     zero = np.zeros(CAMERAS)
     position = RADIUS_M * np.stack([np.sin(a), zero, -np.cos(a)], -1)
-    T = np.tile(np.eye(4), (CAMERAS, 1, 1))
-    T[:, :3, 1] = [0, -1, 0]
-    T[:, :3, 2] = -position / RADIUS_M
-    T[:, :3, 0] = np.cross(T[:, :3, 1], T[:, :3, 2])
-    T[:, :3, 3] = position
-    return T
+    down, forward = np.broadcast_to([0.0, -1, 0], position.shape), -position / RADIUS_M
+    return se3.pose(np.stack([np.cross(down, forward), down, forward], -1), position)
 
 
 def peaks_visible() -> list[Intp]:

@@ -247,13 +247,11 @@ def drifting(
     rotation[half:] += errors.jump * _JUMP_RAD * up
     position[half:] += errors.jump * _JUMP_M
     # Errors of motion add up in the frame of the camera's heading at the time.
-    turn = se3.exp(np.concatenate([np.zeros_like(rotation), rotation], 1))[:, :3, :3]
+    turn = se3.so3_exp(rotation)
     step = np.diff(poses[:, :3, 3], axis=0, prepend=poses[:1, :3, 3])
     step = step * (1 + errors.drift * _SCALE)
-    out = poses.copy()
-    out[:, :3, :3] = turn @ poses[:, :3, :3]
-    out[:, :3, 3] = (turn @ step[..., None])[..., 0].cumsum(0) + poses[0, :3, 3] + position
-    return out
+    positions = (turn @ step[..., None])[..., 0].cumsum(0) + poses[0, :3, 3] + position
+    return se3.pose(turn @ poses[:, :3, :3], positions)
 
 
 def _smooth(rng: np.random.Generator, shape: tuple[int, int]) -> Float64:

@@ -120,9 +120,7 @@ def _biased(frame: RangeFrame, offset_m: float) -> RangeFrame:
     return replace(frame, depth=biased.astype(np.float32))
 
 
-def wander(
-    centre: SequenceOf[float], radii: SequenceOf[float], seconds: float, tilt_rad: float = 0.25
-) -> Path:
+def wander(centre: SequenceOf[float], radii: SequenceOf[float], seconds: float) -> Path:
     """Path of a rig carried around a room: an ellipse, with varying heading, tilt and height.
 
     Parameters
@@ -131,8 +129,6 @@ def wander(
         (3,) and (2,) of the ellipse in m.
     seconds
         Duration of one round.
-    tilt_rad
-        Amplitude of roll and pitch.
     """
     mean_position = np.asarray(centre, float)
 
@@ -143,7 +139,7 @@ def wander(
         heading = u + 0.5 * np.sin(1.7 * u)
         target = np.add(position, [np.cos(heading), np.sin(heading), 0.0])
         T = look_at(position, target)
-        tilts = tilt_rad * np.array([np.sin(3.1 * u + 0.4), 0.0, np.sin(2.3 * u)])
+        tilts = 0.25 * np.array([np.sin(3.1 * u + 0.4), 0.0, np.sin(2.3 * u)])
         return np.asarray(T @ rotation([tilts[0], 0, 0]) @ rotation([0, 0, tilts[2]]), np.float64)
 
     return path

@@ -26,7 +26,7 @@ TAPS = 4
 
 
 def correlate(light: Float64, tap: int, harmonics: tuple[float, float]) -> Float64:
-    """Correlation (H, W) of light (H, W, 7), see `lab.kernels.phasor`, in phase image `tap`."""
+    """Correlation (H, W) of light (H, W, 7), see `phasor_kernels`, in phase image `tap`."""
     # Multiples of a right angle, exactly.
     cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[tap]
     third = harmonics[0] * (light[..., 3] * cosine - light[..., 4] * sine)

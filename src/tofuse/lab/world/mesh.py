@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64, Int64
-from tofuse.engine.geometry import se3, triangles
+from tofuse.engine.geometry import se3, triangles, unit_vectors
 
 # Crease angle: edges below it are smoothed.
-CREASE_RAD = np.deg2rad(48.0)
+_CREASE_RAD = np.deg2rad(48.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +73,11 @@ def joined(meshes: Sequence[Mesh]) -> Mesh:
 
 def face_normals(mesh: Mesh) -> Float64:
     """(F, 3) unit normals; zero for a triangle without area."""
-    n = triangles.crosses(mesh.corners())
-    length = np.linalg.norm(n, axis=1, keepdims=True)
-    return n / np.where(length > 0, length, 1.0)
+    return unit_vectors(triangles.crosses(mesh.corners()))
 
 
-def corner_normals(mesh: Mesh, crease_rad: float = CREASE_RAD) -> Float64:
-    """(F, 3, 3) unit normals at the corners, smooth across edges flatter than `crease_rad`.
+def corner_normals(mesh: Mesh) -> Float64:
+    """(F, 3, 3) unit normals at the corners, smooth across edges flatter than the crease angle.
 
     Each corner takes the area-weighted mean of the triangles that share its vertex and whose
     normals are within the crease angle of its own.
@@ -95,13 +93,15 @@ def corner_normals(mesh: Mesh, crease_rad: float = CREASE_RAD) -> Float64:
     corner = np.repeat(np.arange(len(vertex)), repeats)
     within = np.arange(len(corner)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
     other = order[start[vertex[corner]] + within] // 3
-    within_crease = np.einsum("ij,ij->i", normals[corner // 3], normals[other]) > np.cos(crease_rad)
+    within_crease = np.einsum("ij,ij->i", normals[corner // 3], normals[other]) > np.cos(
+        _CREASE_RAD
+    )
     weight = np.where(within_crease, area[other], 0.0)
     total = np.zeros((len(vertex), 3))
     np.add.at(total, corner, weight[:, None] * normals[other])
     length = np.linalg.norm(total, axis=1, keepdims=True)
     face_normal = np.repeat(normals, 3, axis=0)
-    out = np.where(length > 1e-12, total / np.where(length > 0, length, 1.0), face_normal)
+    out = np.where(length > 1e-12, unit_vectors(total), face_normal)
     return out.reshape(-1, 3, 3)
 
 

@@ -28,14 +28,13 @@ def still(T: Float64) -> Path:
     return lambda _t: T.copy()
 
 
-def turn_angle(t: float, seconds: float, unevenness: float = 0.02) -> float:
+def turn_angle(t: float, seconds: float) -> float:
     """Angle in rad of a full turn by hand: exactly 2 pi at `seconds`, at nearly even speed.
 
-    `unevenness` is the largest relative deviation of the speed from its mean. The angle continues
-    before 0 and after the end.
+    The speed deviates from its mean by 2 % at most. The angle continues before 0 and after the end.
     """
     u = t / seconds
-    return float(2 * np.pi * u + unevenness / 3 * np.sin(3 * 2 * np.pi * u))
+    return float(2 * np.pi * u + 0.02 / 3 * np.sin(3 * 2 * np.pi * u))
 
 
 def camera_turn(T_room_camera: Float64, seconds: float, axis_offset_m: float = 0.0) -> Path:
@@ -43,8 +42,7 @@ def camera_turn(T_room_camera: Float64, seconds: float, axis_offset_m: float = 0
 
     `axis_offset_m` is the distance of the optical centre in front of the stand's axis.
     """
-    arm = np.eye(4)
-    arm[2, 3] = axis_offset_m
+    arm = se3.translation((0, 0, axis_offset_m))
     stand = T_room_camera @ se3.inverse(arm)
 
     def path(t: float) -> Float64:
@@ -60,7 +58,7 @@ def object_turn(seconds: float) -> Path:
 
 def rotation(w: ArrayLike) -> Float64:
     """Rotation (4, 4) by a rotation vector (3,) in rad."""
-    return se3.exp(np.concatenate([np.zeros(3), np.asarray(w, float)]))
+    return se3.pose(se3.so3_exp(w))
 
 
 def smooth_step(u: float) -> float:
@@ -69,17 +67,13 @@ def smooth_step(u: float) -> float:
     return u * u * u * (10.0 + u * (6.0 * u - 15.0))
 
 
-def out_and_back(
-    T_room_camera: Float64, length_m: float, seconds: float, outward_fraction: float = 0.38
-) -> Path:
+def out_and_back(T_room_camera: Float64, length_m: float, seconds: float) -> Path:
     """Translate along the camera's +x axis by `length_m` and back, faster on the way out."""
-    out = outward_fraction * seconds
+    out = 0.38 * seconds
 
     def path(t: float) -> Float64:
         progress = smooth_step(t / out) - smooth_step((t - out) / (seconds - out))
-        step = np.eye(4)
-        step[0, 3] = length_m * progress
-        return T_room_camera @ step
+        return T_room_camera @ se3.translation((length_m * progress, 0, 0))
 
     return path
 
