@@ -211,6 +211,7 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
     hole = depth.copy()
     hole[0, :2] = np.nan
     hole[0, 2] = -1
+    hole = np.ma.masked_array(hole, np.arange(hole.size).reshape(hole.shape) % 80 == 79)
     recording = tofuse.from_arrays(
         hole, K, color=color, amplitude=amplitude, timestamps=[0, 1, 2, 3, 4, 7.5]
     )
@@ -218,6 +219,7 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
     np.testing.assert_array_equal(recording[3].color_image, color[3])
     assert recording.timestamps[-1] == 7.5
     assert (recording[0].depth[:3] == 0).all()
+    assert (recording[0].depth[:, 79] == 0).all()
 
 
 @pytest.mark.parametrize(
@@ -225,7 +227,7 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
     [
         ({"depth": np.ones((60, 80))}, "depth"),
         ({"depth": []}, "depth"),
-        ({"depth": np.ones((6, 60, 80), bool)}, "depth"),
+        ({"depth": np.ones((6, 60, 80), bool)}, "image 0 is of type bool; pass integers or floats"),
         ({"depth": [np.ones((60, 80)), np.ones((60, 80), np.uint16)]}, "integers and floats"),
         ({"depth": np.full((2, 60, 80), 1500.0)}, "depth_unit_m"),
         ({"depth": [np.ones((60, 80)), np.ones((60, 81))]}, "depth"),
@@ -236,7 +238,9 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
         ({"color": np.ones((6, 60, 80, 3))}, "color"),
         ({"color": np.ones((5, 60, 80, 3), np.uint8)}, "color"),
         ({"amplitude": np.ones((6, 30, 40))}, "amplitude"),
-        ({"timestamps": [0, 1, 1, 2, 3, 4]}, "timestamps"),
+        ({"timestamps": [0, 1, 1, 2, 3, 4]}, "timestamps: are not numbers that ascend: that of im"),
+        ({"timestamps": [0, 1, 2, np.nan, 4, 5]}, "that of image 3 is nan"),
+        ({"timestamps": 30}, "timestamps: have shape (), and depth 6 images"),
         ({"reference": np.eye(4)}, "reference"),
         ({"reference": 2 * np.tile(np.eye(4), (6, 1, 1))}, "reference[0]"),
         ({"odometry": [["x"]]}, "odometry"),
@@ -300,6 +304,10 @@ def test_slow_cameras_and_parts_of_images_are_accepted(arrays, times):
         ({"depth": [[1.0]]}, "depth"),
         ({"depth": np.ones(60)}, "depth"),
         ({"amplitude_image": "x"}, "amplitude_image"),
+        ({"depth": np.full((60, 80), 1500, np.uint16)}, "depth: is uint16; use floats in metres"),
+        ({"color_image": np.ones((60, 80, 3))}, "color_image: is float64; use uint8"),
+        ({"color_image": np.ones((60, 80, 4), np.uint8)}, r"color_image: .*shape \(60, 80, 4\)"),
+        ({"confidence_image": np.ones((60, 80), bool)}, "confidence_image: is bool; use uint8"),
     ],
 )
 def test_unusable_frames_are_rejected(arrays, change, named):
