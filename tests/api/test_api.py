@@ -150,8 +150,15 @@ def test_evaluate_accepts_files_and_arrays(result, arrays, tmp_path):
     for wrong in (2 * poses, poses @ np.diag([-1, 1, 1, 1]), poses.transpose(0, 2, 1)):
         with pytest.raises(tofuse.InputError, match=r"estimate\[\d\]: "):
             tofuse.evaluate(wrong, poses)
+    # Without its recording a result knows the times of its frames.
+    loaded = tofuse.load(tmp_path / "out")
+    shutil.copy(tmp_path / "out/trajectory.txt", tmp_path / "true.txt")
+    assert loaded.evaluate(tmp_path / "true.txt").error.ate_rms_m < 1e-6
+    assert loaded.evaluate(poses).error.ate_rms_m == pytest.approx(by_array)
+    with pytest.raises(tofuse.InputError, match="holds 5 poses, and the recording 6 frames"):
+        loaded.evaluate(poses[:5])
     with pytest.raises(tofuse.InputError, match="no reference"):
-        tofuse.load(tmp_path / "out").evaluate()
+        loaded.evaluate()
 
 
 def test_mapper_states_each_pose_and_its_result_is_saved(arrays, tmp_path):
@@ -345,6 +352,8 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: result.locate(arrays[0][0]), "frame: is a ndarray, not an image"),
         (lambda: result.evaluate(arrays[2], reference_error_m=-1), "reference_error_m: is -1"),
         (lambda: tofuse.judge(recording, arrays[2], tolerance_m=-1), "tolerance_m: is -1"),
+        (lambda: tofuse.judge(arrays[0], arrays[2]), "path: is a ndarray"),
+        (lambda: tofuse.judge(tmp_path, arrays[2]), "is an empty folder"),
         (lambda: tofuse.judge(recording, arrays[2], threads=0), "threads: is 0"),
         (lambda: tofuse.reconstruct(recording, threads=0), "threads: is 0"),
         (lambda: tofuse.reconstruct(recording, seed=-1), "seed: is -1"),
