@@ -405,7 +405,8 @@ def _registered(
         elif found.given_guess and guess is not None:
             names.append("another pose fits nearly as well")
         elif found.given_guess:
-            found = replace(found, believed=False, reason="another pose fits as well")
+            reason, remedy = "another pose fits as well", "a guess near this one"
+            found = replace(found, believed=False, reason=reason, remedy=remedy)
     slides = _slides(reference, T, found.unobservable)
     if slides:
         frames = [
@@ -417,7 +418,7 @@ def _registered(
     given = f"given {start}: {'; '.join(names)}" if names else ""
     if found.believed or given:
         return found, given, ""
-    return found, "", f"the registration is not accepted: {found.reason or 'it is not verified'}"
+    return found, "", f"the registration is not accepted: {pair_words.doubt(found)}"
 
 
 def _distance(points: Float64, T: Float64, T_other: Float64) -> float:
