@@ -19,12 +19,14 @@ from tofuse.apps.report import scene, words
 from tofuse.apps.results import run_json
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Bool, Float64, Intp
+from tofuse.engine.bounds import Bounds
 from tofuse.engine.clouds import AnyPair
 from tofuse.engine.errors import InputError, RegistrationError
 from tofuse.engine.frames import CloudFrame
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import OF_95_PERCENT
+from tofuse.engine.parts import check_number
 from tofuse.formats.geometry import surface_points
 from tofuse.formats.recordings import SingleView
 
@@ -302,8 +304,8 @@ def compare(
     """
     start = None if guess is None else se3.check_pose(guess, where="guess")
     for value, where in ((tolerance_m, "tolerance_m"), (accuracy_m, "accuracy_m")):
-        if value is not None and not 0 < value < np.inf:
-            raise InputError(f"is {value}", where=where, remedy="pass a positive length in m")
+        if value is not None:
+            check_number(value, Bounds(0, exclusive=True), where)
     measured, nominal, said = in_metres(surface_of(result), surface_of(reference), unit)
     if accuracy_m is not None:
         measured = replace(measured, shared_m=accuracy_m / OF_95_PERCENT)
