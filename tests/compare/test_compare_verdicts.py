@@ -256,7 +256,7 @@ def test_python_compares_meshes_and_clouds(part) -> None:
     assert found.verdict == "pass"
     assert "Comparison: Pass" in repr(found)
     for wrong in ({"tolerance_m": -1.0}, {"accuracy_m": 0.0}):
-        with pytest.raises(InputError, match="_m: is .*; pass a finite number, above 0"):
+        with pytest.raises(InputError, match=r"_m: is .*; pass a finite number, above 0"):
             tofuse.compare(mesh, mesh, **wrong)
 
 
