@@ -236,6 +236,10 @@ def test_changes_are_significant_from_the_detection_limit(part) -> None:
     assert compared(scan(part, 1, bump=3 * limit), part, searched=False).changed > 0
 
 
+def test_zero_has_no_sign() -> None:
+    assert [comparing.millimetres(v) for v in (-1e-6, -1e-5, -0.02)] == ["0.00", "-0.01", "-20.0"]
+
+
 def test_the_unit_of_a_file_is_recognised() -> None:
     nominal = drawn()
     in_mm = replace(nominal, points=1000 * nominal.points)

@@ -162,7 +162,7 @@ class Comparison:
         """What was found, in a few sentences."""
         places = self.deviations.places
         worst = int(np.abs(places.deviation).argmax())
-        at = ", ".join(f"{1e3 * v:.0f}" for v in places.centres[worst])
+        at = ", ".join(f"{1e3 * v:z.0f}" for v in places.centres[worst])
         largest = (
             f"{millimetres(places.deviation[worst])} \N{PLUS-MINUS SIGN} "
             f"{millimetres(COVERAGE * places.sigma[worst])} mm at ({at}) mm"
@@ -197,7 +197,7 @@ class Comparison:
         if not self.deviations.unmatched:
             return found
         first = self.deviations.unmatched[0]
-        at = ", ".join(f"{1e3 * v:.0f}" for v in first.centre_m)
+        at = ", ".join(f"{1e3 * v:z.0f}" for v in first.centre_m)
         area = 1e4 * sum(each.area_m2 for each in self.deviations.unmatched)
         return (
             f"{found} The reference lacks {area:.0f} cm\N{SUPERSCRIPT TWO} of what was measured, "
@@ -263,7 +263,7 @@ def _word(verdict: int) -> Verdict:
 def millimetres(metres: float) -> str:
     """Return a length in mm as text, to a hundredth below 10 mm."""
     mm = 1e3 * float(metres)
-    return f"{mm:.2f}" if abs(mm) < 9.995 else f"{mm:.1f}"
+    return f"{mm:z.2f}" if abs(mm) < 9.995 else f"{mm:.1f}"
 
 
 def compare(
