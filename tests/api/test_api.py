@@ -150,8 +150,15 @@ def test_evaluate_accepts_files_and_arrays(result, arrays, tmp_path):
     for wrong in (2 * poses, poses @ np.diag([-1, 1, 1, 1]), poses.transpose(0, 2, 1)):
         with pytest.raises(tofuse.InputError, match=r"estimate\[\d\]: "):
             tofuse.evaluate(wrong, poses)
+    # Without its recording a result knows the times of its frames.
+    loaded = tofuse.load(tmp_path / "out")
+    shutil.copy(tmp_path / "out/trajectory.txt", tmp_path / "true.txt")
+    assert loaded.evaluate(tmp_path / "true.txt").error.ate_rms_m < 1e-6
+    assert loaded.evaluate(poses).error.ate_rms_m == pytest.approx(by_array)
+    with pytest.raises(tofuse.InputError, match="holds 5 poses, and the recording 6 frames"):
+        loaded.evaluate(poses[:5])
     with pytest.raises(tofuse.InputError, match="no reference"):
-        tofuse.load(tmp_path / "out").evaluate()
+        loaded.evaluate()
 
 
 def test_mapper_states_each_pose_and_its_result_is_saved(arrays, tmp_path):
@@ -211,6 +218,7 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
     hole = depth.copy()
     hole[0, :2] = np.nan
     hole[0, 2] = -1
+    hole = np.ma.masked_array(hole, np.arange(hole.size).reshape(hole.shape) % 80 == 79)
     recording = tofuse.from_arrays(
         hole, K, color=color, amplitude=amplitude, timestamps=[0, 1, 2, 3, 4, 7.5]
     )
@@ -218,6 +226,7 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
     np.testing.assert_array_equal(recording[3].color_image, color[3])
     assert recording.timestamps[-1] == 7.5
     assert (recording[0].depth[:3] == 0).all()
+    assert (recording[0].depth[:, 79] == 0).all()
 
 
 @pytest.mark.parametrize(
@@ -225,7 +234,7 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
     [
         ({"depth": np.ones((60, 80))}, "depth"),
         ({"depth": []}, "depth"),
-        ({"depth": np.ones((6, 60, 80), bool)}, "depth"),
+        ({"depth": np.ones((6, 60, 80), bool)}, "image 0 is of type bool; pass integers or floats"),
         ({"depth": [np.ones((60, 80)), np.ones((60, 80), np.uint16)]}, "integers and floats"),
         ({"depth": np.full((2, 60, 80), 1500.0)}, "depth_unit_m"),
         ({"depth": [np.ones((60, 80)), np.ones((60, 81))]}, "depth"),
@@ -236,7 +245,9 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
         ({"color": np.ones((6, 60, 80, 3))}, "color"),
         ({"color": np.ones((5, 60, 80, 3), np.uint8)}, "color"),
         ({"amplitude": np.ones((6, 30, 40))}, "amplitude"),
-        ({"timestamps": [0, 1, 1, 2, 3, 4]}, "timestamps"),
+        ({"timestamps": [0, 1, 1, 2, 3, 4]}, "timestamps: are not numbers that ascend: that of im"),
+        ({"timestamps": [0, 1, 2, np.nan, 4, 5]}, "that of image 3 is nan"),
+        ({"timestamps": 30}, "timestamps: have shape (), and depth 6 images"),
         ({"reference": np.eye(4)}, "reference"),
         ({"reference": 2 * np.tile(np.eye(4), (6, 1, 1))}, "reference[0]"),
         ({"odometry": [["x"]]}, "odometry"),
@@ -300,6 +311,10 @@ def test_slow_cameras_and_parts_of_images_are_accepted(arrays, times):
         ({"depth": [[1.0]]}, "depth"),
         ({"depth": np.ones(60)}, "depth"),
         ({"amplitude_image": "x"}, "amplitude_image"),
+        ({"depth": np.full((60, 80), 1500, np.uint16)}, "depth: is uint16; use floats in metres"),
+        ({"color_image": np.ones((60, 80, 3))}, "color_image: is float64; use uint8"),
+        ({"color_image": np.ones((60, 80, 4), np.uint8)}, r"color_image: .*shape \(60, 80, 4\)"),
+        ({"confidence_image": np.ones((60, 80), bool)}, "confidence_image: is bool; use uint8"),
     ],
 )
 def test_unusable_frames_are_rejected(arrays, change, named):
@@ -337,6 +352,8 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: result.locate(arrays[0][0]), "frame: is a ndarray, not an image"),
         (lambda: result.evaluate(arrays[2], reference_error_m=-1), "reference_error_m: is -1"),
         (lambda: tofuse.judge(recording, arrays[2], tolerance_m=-1), "tolerance_m: is -1"),
+        (lambda: tofuse.judge(arrays[0], arrays[2]), "path: is a ndarray"),
+        (lambda: tofuse.judge(tmp_path, arrays[2]), "is an empty folder"),
         (lambda: tofuse.judge(recording, arrays[2], threads=0), "threads: is 0"),
         (lambda: tofuse.reconstruct(recording, threads=0), "threads: is 0"),
         (lambda: tofuse.reconstruct(recording, seed=-1), "seed: is -1"),
@@ -347,6 +364,9 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: tofuse.reconstruct(recording, None), "config: is a NoneType"),
         (lambda: tofuse.reconstruct(recording, {"method": []}), r"is \[\]; use one of"),
         (lambda: tofuse.reconstruct(recording, loops=[(0, "a")]), "loops: 0 'a'"),
+        (lambda: tofuse.reconstruct(recording, loops=[(0, 6)]), "loops: there is no frame 6"),
+        (lambda: tofuse.compare(result, result, tolerance_m="2mm"), "tolerance_m: is '2mm'"),
+        (lambda: result.distance(None, [0, 0, 0]), "are not two different points"),
         (lambda: tofuse.register(*recording[:2], guess="eye"), "guess: is not a matrix"),
         (lambda: tofuse.CloudFrame(0, 0.0, far), r"coordinates up to 1e\+20"),
         (lambda: cloud(origin=np.full(3, np.nan)), "frame 0: origin"),

@@ -59,6 +59,7 @@ def test_all_files_are_written(files, tmp_path, capfd) -> None:
     rows = list(csv.DictReader((out / "deviations.csv").read_text().splitlines()))
     assert max(abs(float(row["deviation_m"])) for row in rows) > 0.004
     page = (out / "report.html").read_text()
+    assert "deviation, mm" in page
     assert "<strong>Fail</strong>" in page
     # A comparison may be replaced, other files may not.
     refuses(capfd, *words, "--out", out, says=("--overwrite",))

@@ -19,7 +19,7 @@ from tofuse.apps.pairs import register
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.fusion.mesh import Mesh
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import KdTree, se3
 from tofuse.lab.world import mesh as meshes
 
 T = se3.exp([0.3, 0.1, -0.2, 0.4, 1.0, -0.3])
@@ -51,6 +51,27 @@ def test_distances_are_exact_and_signed(part) -> None:
     assert not surface.distances(points, -up, reach).compared.any()
     beside = points + np.array([0.2, 0, 0.005])
     assert not surface.distances(beside, up, reach).compared.any()
+
+
+def test_distances_are_those_of_an_unlimited_search(part, monkeypatch) -> None:
+    rng = np.random.default_rng(4)
+    points = part.centres[rng.integers(len(part.centres), size=300)]
+    points = points + rng.normal(0, 1, (300, 3)) * 10 ** rng.uniform(-4, 0, (300, 1))
+    reach = Reach(0.02, 0.002)
+    found = part.distances(points, np.zeros((300, 3)), reach)
+    limits = []
+
+    def unlimited(tree, queries, k, max_distance=np.inf):
+        limits.append(max_distance)
+        return search(tree, queries, k)
+
+    search = KdTree.neighbours
+    monkeypatch.setattr(KdTree, "neighbours", unlimited)
+    wanted = part.distances(points, np.zeros((300, 3)), reach)
+    assert 50 < wanted.compared.sum() < 250
+    np.testing.assert_array_equal(found.signed, wanted.signed)
+    # A search for neighbours of points that are far from all takes thousands of times as long.
+    assert max(limits) < 0.05
 
 
 def test_faces_of_a_cad_model_are_regions(part) -> None:
@@ -154,7 +175,8 @@ def test_a_guess_excludes_rivals_that_are_far_from_it(part, monkeypatch) -> None
 
     def doubtful(source, target, guess=None, method=None):
         found = register(source, target, guess=guess, method=method)
-        return found if method else replace(found, believed=False, runner_up=turned, reason="close")
+        doubt = {"reason": "close", "remedy": "a guess near it"}
+        return found if method else replace(found, believed=False, runner_up=turned, **doubt)
 
     monkeypatch.setattr(comparing, "register", doubtful)
     measured = moved(scan(part))
@@ -165,7 +187,8 @@ def test_a_guess_excludes_rivals_that_are_far_from_it(part, monkeypatch) -> None
     # Without one, or between both, it is not decided.
     between = se3.exp(np.array([0, 0, 0, 0, 0, 0.4 * np.pi])) @ right
     for guess in (None, between):
-        assert "not accepted: close" in compared(measured, part, 0.002, guess).sentence
+        said = compared(measured, part, 0.002, guess).sentence
+        assert "not accepted: close; a guess near it would decide" in said
 
 
 @pytest.mark.nightly_part
@@ -213,6 +236,10 @@ def test_changes_are_significant_from_the_detection_limit(part) -> None:
     assert compared(scan(part, 1, bump=3 * limit), part, searched=False).changed > 0
 
 
+def test_zero_has_no_sign() -> None:
+    assert [comparing.millimetres(v) for v in (-1e-6, -1e-5, -0.02)] == ["0.00", "-0.01", "-20.0"]
+
+
 def test_the_unit_of_a_file_is_recognised() -> None:
     nominal = drawn()
     in_mm = replace(nominal, points=1000 * nominal.points)
@@ -233,7 +260,7 @@ def test_python_compares_meshes_and_clouds(part) -> None:
     assert found.verdict == "pass"
     assert "Comparison: Pass" in repr(found)
     for wrong in ({"tolerance_m": -1.0}, {"accuracy_m": 0.0}):
-        with pytest.raises(InputError, match="positive length"):
+        with pytest.raises(InputError, match=r"_m: is .*; pass a finite number, above 0"):
             tofuse.compare(mesh, mesh, **wrong)
 
 

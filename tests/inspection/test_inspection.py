@@ -114,6 +114,7 @@ def test_few_and_no_valid_points_are_detected() -> None:
     assert few.startswith("Only 5.0% of the pixels are valid.")
     found = inspect_recording(of([image(0.0)]))
     assert [f.code for f in found.findings] == ["few_valid"]
+    assert repr(found).endswith(": warning few_valid")
     assert "is the depth unit right?" in found.warnings[0]
     assert "no valid point" in found.facts["depth"]
     (empty,) = inspect_recording(of([CloudFrame.of(np.zeros((0, 3)))])).warnings

@@ -161,6 +161,10 @@ def test_jump_is_named_and_nothing_of_correct_poses(of_truth, of_bent) -> None:
     assert cause.frames == (3, 4)
     assert cause.text in of_bent.reasons[0].text
     assert cause.text in sentence(of_bent, "poses.txt")
+    assert repr(of_bent).startswith(f"Judgement: {of_bent.verdict}. poses: ")
+    # What is wrong, but by less than the tolerance, may still be uncertain by more.
+    unsure = replace(of_bent, reasons=())
+    assert "with the depth, but not significantly beyond the tol" in sentence(unsure, "poses.txt")
     assert of_bent.to_dict()["cause"]["frames"] == [3, 4]
 
 

@@ -8,6 +8,7 @@ import struct
 import sys
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -324,6 +325,13 @@ def test_missing_topics_are_named(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "ros1")
     bag.image(TOPIC, 10, COUNTS[0], "16UC1")
     with pytest.raises(InputError, match=r"has no CameraInfo for .*; pass .* --camera"):
+        open_recording(bag.close())
+    (tmp_path / "k").mkdir()
+    bag = Bag(tmp_path / "k", "ros1")
+    bag.image(TOPIC, 10, COUNTS[0], "16UC1")
+    unknown = SimpleNamespace(width=64, height=48, fx=0, fy=0, cx=0, cy=0)
+    bag.info(f"{TOPIC.rpartition('/')[0]}/camera_info", D=(), lens=unknown)
+    with pytest.raises(InputError, match=r"not calibrated \(K is zero\); pass .* --camera"):
         open_recording(bag.close())
     (tmp_path / "b").mkdir()
     bag = Bag(tmp_path / "b", "ros1")

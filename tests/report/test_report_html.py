@@ -389,6 +389,8 @@ def test_charts_have_values_gaps_and_text(shown):
 )
 def test_logarithmic_axis_is_linear_near_zero(values, scale):
     y = np.array(values, float)
+    fine = plots.lines(np.array([-0.25, 1e5]), {"after": np.ones(2)}, label="a", ylabel="b")
+    assert json.dumps(fine["x"]) == "[-0.25, 100000]"
     chart = plots.lines(np.arange(3.0), {"after": y}, label="a", ylabel="b", log=True)
     assert chart["scale"] == scale
     assert chart["series"]["after"][2] == (0.0 if values[2] == 0 else None)

@@ -13,7 +13,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-import numpy as np
 from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
@@ -171,10 +170,9 @@ class Result(Reconstruction):
                 where="the recording" if self.source else "the loaded result",
                 remedy="pass a reference",
             )
-        poses_or_path = poses if isinstance(poses, str | Path) else np.asarray(poses, float)
         return evaluate(
-            self.trajectory,
-            poses_or_path,
+            self,
+            poses if isinstance(poses, str | Path) else se3.check_poses(poses, where="reference"),
             recording=self.source,
             reference_error_m=reference_error_m,
             config=self.config,

@@ -135,7 +135,10 @@ class LengthErrors:
         InputError
             If they are not two different points.
         """
-        ends = np.array([a, b], float)
+        try:
+            ends = np.array([a, b], float)
+        except (TypeError, ValueError):
+            ends = np.zeros(0)
         if ends.shape != (2, 3) or not np.isfinite(ends).all() or not np.ptp(ends, axis=0).any():
             raise InputError("are not two different points (3,)", where="the ends of the length")
         ends -= self.centre

@@ -24,7 +24,7 @@ def compare(arguments: cli.Compare) -> int:
     if color := _COLORS.get(head.lower()) if found else None:
         sentence = f"[bold {color}]{head.lower()}[/]: {escaped(rest)}"
     table = Table.grid(padding=(0, 2))
-    table.add_row("region", "verdict", "seen", "mean", "worst, mm", "detection limit, mm")
+    table.add_row("region", "verdict", "seen", "mean, mm", "worst, mm", "detection limit, mm")
     seen = [region for region in comparison.regions if region.places]
     for region in sorted(seen, key=lambda r: -abs(r.worst_m))[:_ROWS]:
         verdict = region.verdict if comparison.verdict else "changed" if region.changed else "-"

@@ -19,12 +19,14 @@ from tofuse.apps.report import scene, words
 from tofuse.apps.results import run_json
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Bool, Float64, Intp
+from tofuse.engine.bounds import Bounds
 from tofuse.engine.clouds import AnyPair
 from tofuse.engine.errors import InputError, RegistrationError
 from tofuse.engine.frames import CloudFrame
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import OF_95_PERCENT
+from tofuse.engine.parts import check_number
 from tofuse.formats.geometry import surface_points
 from tofuse.formats.recordings import SingleView
 
@@ -160,7 +162,7 @@ class Comparison:
         """What was found, in a few sentences."""
         places = self.deviations.places
         worst = int(np.abs(places.deviation).argmax())
-        at = ", ".join(f"{1e3 * v:.0f}" for v in places.centres[worst])
+        at = ", ".join(f"{1e3 * v:z.0f}" for v in places.centres[worst])
         largest = (
             f"{millimetres(places.deviation[worst])} \N{PLUS-MINUS SIGN} "
             f"{millimetres(COVERAGE * places.sigma[worst])} mm at ({at}) mm"
@@ -195,7 +197,7 @@ class Comparison:
         if not self.deviations.unmatched:
             return found
         first = self.deviations.unmatched[0]
-        at = ", ".join(f"{1e3 * v:.0f}" for v in first.centre_m)
+        at = ", ".join(f"{1e3 * v:z.0f}" for v in first.centre_m)
         area = 1e4 * sum(each.area_m2 for each in self.deviations.unmatched)
         return (
             f"{found} The reference lacks {area:.0f} cm\N{SUPERSCRIPT TWO} of what was measured, "
@@ -261,7 +263,7 @@ def _word(verdict: int) -> Verdict:
 def millimetres(metres: float) -> str:
     """Return a length in mm as text, to a hundredth below 10 mm."""
     mm = 1e3 * float(metres)
-    return f"{mm:.2f}" if abs(mm) < 9.995 else f"{mm:.1f}"
+    return f"{mm:z.2f}" if abs(mm) < 9.995 else f"{mm:.1f}"
 
 
 def compare(
@@ -302,8 +304,8 @@ def compare(
     """
     start = None if guess is None else se3.check_pose(guess, where="guess")
     for value, where in ((tolerance_m, "tolerance_m"), (accuracy_m, "accuracy_m")):
-        if value is not None and not 0 < value < np.inf:
-            raise InputError(f"is {value}", where=where, remedy="pass a positive length in m")
+        if value is not None:
+            check_number(value, Bounds(0, exclusive=True), where)
     measured, nominal, said = in_metres(surface_of(result), surface_of(reference), unit)
     if accuracy_m is not None:
         measured = replace(measured, shared_m=accuracy_m / OF_95_PERCENT)
@@ -405,7 +407,8 @@ def _registered(
         elif found.given_guess and guess is not None:
             names.append("another pose fits nearly as well")
         elif found.given_guess:
-            found = replace(found, believed=False, reason="another pose fits as well")
+            reason, remedy = "another pose fits as well", "a guess near this one"
+            found = replace(found, believed=False, reason=reason, remedy=remedy)
     slides = _slides(reference, T, found.unobservable)
     if slides:
         frames = [
@@ -417,7 +420,7 @@ def _registered(
     given = f"given {start}: {'; '.join(names)}" if names else ""
     if found.believed or given:
         return found, given, ""
-    return found, "", f"the registration is not accepted: {found.reason or 'it is not verified'}"
+    return found, "", f"the registration is not accepted: {pair_words.doubt(found)}"
 
 
 def _distance(points: Float64, T: Float64, T_other: Float64) -> float:

@@ -214,8 +214,11 @@ class Reference:
 
         A surface that faces elsewhere is another one. Beyond a border there is none.
         """
+        # Triangles beyond have no point within reach, and a search for them takes long.
+        beside = max(reach.beside, _BESIDE * reach.along, self.size)
+        limit = float(np.hypot(reach.along, beside)) + self.size
         parts = [
-            self._nearest(points[a : a + _CHUNK], normals[a : a + _CHUNK], oriented)
+            self._nearest(points[a : a + _CHUNK], normals[a : a + _CHUNK], oriented, limit)
             for a in range(0, max(len(points), 1), _CHUNK)
         ]
         feet, element = (np.concatenate(each) for each in zip(*parts, strict=True))
@@ -237,10 +240,16 @@ class Reference:
             cosine = np.abs(cosine)
         return np.asarray((cosine > _MIN_COSINE) | ~normals.any(-1))
 
-    def _nearest(self, points: Float64, normals: Float64, oriented: bool) -> tuple[Float64, Intp]:
-        """Return the nearest point (n, 3) of triangles facing alike, and the triangle (n,)."""
+    def _nearest(
+        self, points: Float64, normals: Float64, oriented: bool, limit: float = np.inf
+    ) -> tuple[Float64, Intp]:
+        """Return the nearest point (n, 3) of triangles facing alike, and the triangle (n,).
+
+        Any triangle if the centre of none is within the limit.
+        """
         k = min(_CANDIDATES, len(self.triangles))
-        index = self._tree.neighbours(points, k)[0]
+        index = self._tree.neighbours(points, k, limit)[0]
+        index = np.where(index < 0, index[:, :1], index)
         if self.surface.faces is None:
             feet = self.centres[index]
         else:

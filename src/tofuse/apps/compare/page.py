@@ -135,15 +135,14 @@ def compare_scene(comparison: Comparison) -> tuple[scene.Scene, fields.Field]:
 def _histogram(comparison: Comparison) -> dict[str, object]:
     limit = 2 * limit_of(comparison)
     d = np.clip(comparison.deviations.places.deviation, -limit, limit)
-    step = max(round(2e6 * limit / _BINS), 1)
-    edges = step * (np.arange(_BINS + 1) - _BINS / 2)
-    counts = np.histogram(1e6 * d, edges, weights=comparison.deviations.places.points)[0]
+    edges = 1e3 * np.linspace(-limit, limit, _BINS + 1)
+    counts = np.histogram(1e3 * d, edges, weights=comparison.deviations.places.points)[0]
     share = 100 * counts / max(counts.sum(), 1)
     return plots.lines(
         0.5 * (edges[1:] + edges[:-1]),
         {"after": share},
         label="Histogram of the deviations of places",
         ylabel="share of the surface, %",
-        xlabel="deviation, µm",
+        xlabel="deviation, mm",
         floor=True,
     )

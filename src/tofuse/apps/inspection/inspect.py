@@ -70,6 +70,10 @@ class Inspection:
     notes: tuple[str, ...]
     frames: tuple[Frame, ...]
 
+    def __repr__(self) -> str:
+        found = ", ".join(f"{finding.severity} {finding.code}" for finding in self.findings)
+        return f"Inspection of {self.recording.path}: {found or 'no problems found'}"
+
     @cached_property
     def facts(self) -> dict[str, str]:
         """Facts by name, as text."""

@@ -78,8 +78,8 @@ def evaluate(
         result in memory, or (N, 4, 4) T_world_camera of the frames of the recording, NaN where
         there is none.
     recording
-        Provides the timestamps of frames if the files don't, and images whose map consistency is
-        measured.
+        Provides the timestamps of frames if the poses have none, and images whose map consistency
+        is measured.
     reference_error_m
         Rms error of the reference, m.
     config
@@ -101,7 +101,10 @@ def evaluate(
     ]
     of_estimate, _ = _result_of(estimate), _result_of(reference)
     clock = None
-    if of_estimate is not None and of_estimate.folder == Path(str(estimate)):
+    if isinstance(estimate, Reconstruction):
+        indices = np.array([frame.index for frame in estimate.diagnostics.frames], np.intp)
+        clock = estimate.timestamps, indices
+    elif of_estimate is not None and of_estimate.folder == Path(str(estimate)):
         clock = of_estimate.clock
     if recording is not None:
         clock = recording.timestamps, recording.indices
@@ -111,7 +114,7 @@ def evaluate(
         raise InputError(
             "has poses by frame, the other file by time",
             where=by_frame[0],
-            remedy="pass the recording, which has the times, with --recording",
+            remedy="pass the recording, which has the times (--recording)",
         )
     arrays = [isinstance(source, np.ndarray) for source in (estimate, reference)]
     if all(arrays) and len(timed[0].poses) != len(timed[1].poses):

@@ -55,7 +55,7 @@ from tofuse.engine.stored_views import PosedView, Spacing
 from tofuse.engine.tracking import FrameTime, find_jumps, given
 from tofuse.engine.views import PreparedView
 from tofuse.formats.poses import TimedPoses, read_poses
-from tofuse.formats.recordings import Opening, OpeningOptions, read_reference
+from tofuse.formats.recordings import Opening, OpeningOptions, open_recording, read_reference
 
 Views = Sequence[PosedView[PreparedView]]
 
@@ -130,6 +130,9 @@ class Judgement:
         """The result of all frames, as a run makes it; computed when it is first used."""
         return self._reconstruct()
 
+    def __repr__(self) -> str:
+        return f"Judgement: {self.verdict}. {sentence(self, 'poses')}"
+
     def to_dict(self) -> dict[str, Any]:
         """Return the content of `judge.json`, with inf as it is."""
         return {
@@ -157,7 +160,7 @@ def _dict(figures: Any) -> dict[str, Any] | None:
 
 
 def judge(
-    recording: Recording,
+    recording: Recording | str | Path,
     trajectory: str | Path | Float64 | Reconstruction,
     *,
     tolerance_m: float | None = None,
@@ -170,7 +173,7 @@ def judge(
     Parameters
     ----------
     recording
-        Range images, as of `tofuse.open`.
+        Range images, as of `tofuse.open`, or their path.
     trajectory
         A file of any format of `poses.trajectory_formats`, a result or its folder, a recording with
         poses, or (N, 4, 4) T_world_camera of the frames, NaN where there is none. Timed poses are
@@ -194,6 +197,8 @@ def judge(
     progress = progress or Silent()
     if tolerance_m is not None:
         check_number(tolerance_m, Bounds(0, exclusive=True), "tolerance_m")
+    if not isinstance(recording, Recording):
+        recording = open_recording(recording)
     given_poses = poses_for(recording, trajectory)
     kind = reconstructing.view_kind(recording)
     # External sensors do not measure these poses, and images are compared with the stated camera.
@@ -564,8 +569,11 @@ def _agreement(judgement: Judgement) -> str:
     if not deviation.consistent:
         about, at_least = map(_length, (deviation.estimate_m, deviation.at_least_m))
         beyond = any(r.code == "inconsistent_poses" for r in judgement.reasons)
-        label = "Inconsistent with the depth" if beyond else "Errors within the tolerance"
-        return f" {label}: surfaces displaced by about {about}, at least {at_least} (95 %)."
+        limit = "" if beyond else ", but not significantly beyond the tolerance"
+        return (
+            f" Inconsistent with the depth{limit}: surfaces displaced by about {about}, "
+            f"at least {at_least} (95 %)."
+        )
     if not np.isfinite(deviation.at_most_m):
         return " Consistent with the depth, as far as that constrains them."
     return f" Consistent with the depth to within {_length(deviation.at_most_m)} (95 %)."

@@ -26,14 +26,17 @@ def decision(result: PairResult) -> tuple[str, str]:
             rival = "none was tried" if registration.runner_up is None else "one fits as well"
             parts.append(f"given the {near}: of other poses {rival}")
         return "Accepted", "; ".join(parts)
+    parts += [text] if (text := doubt(registration)) else []
+    return "Not verified" if registration.believed is None else "Rejected", "; ".join(parts)
+
+
+def doubt(registration: Registration) -> str:
+    """Return why a pose is not accepted, and what would decide."""
     reason = registration.reason
     if registration.believed is None:
         reason = reason or "the method can't verify its result"
-    if reason:
-        parts.append(reason)
-    if registration.remedy:
-        parts.append(f"{registration.remedy} would decide")
-    return "Not verified" if registration.believed is None else "Rejected", "; ".join(parts)
+    remedy = f"{registration.remedy} would decide" if registration.remedy else ""
+    return "; ".join(text for text in (reason, remedy) if text)
 
 
 def lines(result: PairResult) -> list[tuple[str, str]]:

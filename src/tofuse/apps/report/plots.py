@@ -35,7 +35,7 @@ def lines(
     Parameters
     ----------
     x
-        Whole numbers, increasing.
+        Increasing; ticks are at whole numbers if all are.
     series
         y by the name of the line, which is a colour of the page; NaN leaves a gap.
     log
@@ -60,7 +60,7 @@ def lines(
         "label": label,
         "xlabel": xlabel,
         "ylabel": ylabel,
-        "x": x.astype(int).tolist(),
+        "x": [int(value) if value == int(value) else _rounded(value) for value in x.tolist()],
         "series": {name: [_rounded(value) for value in y.tolist()] for name, y in series.items()},
         "scale": scale,
         "zero": zero,

@@ -121,11 +121,22 @@ class RangeFrame:
             image = getattr(self, name)
             if image is None:
                 continue
-            ndim = 3 if name in ("color_image", "normal_image") else 2
+            last = (3,) if name in ("color_image", "normal_image") else ()
             is_array = isinstance(image, np.ndarray) and image.dtype.kind in "biuf"
-            if not is_array or image.ndim != ndim:
-                problem = f"is a {type(image).__name__}, not an array of numbers with {ndim} axes"
-                raise InputError(problem, where=f"{where}: {name}", remedy="pass a NumPy array")
+            if not is_array or image.ndim != 2 + len(last) or image.shape[2:] != last:
+                given = f"an array of shape {image.shape}" if is_array else type(image).__name__
+                raise InputError(
+                    f"is {given}, not numbers of shape (H, W{', 3' if last else ''})",
+                    where=f"{where}: {name}",
+                    remedy="pass a NumPy array",
+                )
+            # Integers are in another unit than metres, and floats of colour may end at 1.
+            if name == "depth" and image.dtype.kind != "f":
+                remedy = "use floats in metres: divide integers in millimetres by 1000"
+                raise InputError(f"is {image.dtype}", where=f"{where}: depth", remedy=remedy)
+            if name in ("color_image", "confidence_image") and image.dtype != np.uint8:
+                remedy = "use uint8, from 0 to 255"
+                raise InputError(f"is {image.dtype}", where=f"{where}: {name}", remedy=remedy)
             if image.shape[:2] != shape:
                 raise InputError(
                     f"{name} is {image.shape[1]} x {image.shape[0]}, the camera "

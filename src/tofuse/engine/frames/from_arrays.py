@@ -123,7 +123,8 @@ def _images(
     name: str, values: Any, shape: tuple[int, ...] | None, kinds: str = "iufb"
 ) -> list[NDArray[Any]]:
     try:
-        images = [np.asarray(image) for image in values]
+        # A masked pixel has no value; `asarray` would return what is under the mask.
+        images = [np.ma.filled(image, 0) for image in values]
     except TypeError as error:
         raise InputError(
             "is not an array of images", where=name, remedy="pass (N, H, W)"
@@ -132,9 +133,15 @@ def _images(
         raise InputError("contains no image", where=name)
     expected = images[0].shape if shape is None else shape
     for k, image in enumerate(images):
-        if image.dtype.kind not in kinds or image.shape != expected:
+        if image.dtype.kind not in kinds:
             raise InputError(
-                f"image {k} is {image.dtype} of shape {image.shape}, not {expected}",
+                f"image {k} is of type {image.dtype}",
+                where=name,
+                remedy=f"pass integers or floats (N, {', '.join(map(str, expected))})",
+            )
+        if image.shape != expected:
+            raise InputError(
+                f"image {k} is of shape {image.shape}, not {expected}",
                 where=name,
                 remedy=f"pass (N, {', '.join(map(str, expected))})",
             )
@@ -215,14 +222,23 @@ def _camera(camera: Camera | ArrayLike, shape: tuple[int, ...], count: int) -> C
 def _times(timestamps: ArrayLike | None, count: int) -> Float64:
     if timestamps is None:
         return np.arange(count) / 30
-    times = np.asarray(timestamps)
-    is_number = times.dtype.kind in "iuf"
-    times = _seconds(times) if times.dtype.kind in "iufmM" else np.full(count, np.nan)
-    if times.shape != (count,) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+    given = np.asarray(timestamps)
+    is_number = given.dtype.kind in "iuf"
+    times = _seconds(given) if given.dtype.kind in "iufmM" else np.full(given.shape, np.nan)
+    if times.shape != (count,):
         raise InputError(
-            "must be one finite number for each image, ascending",
+            f"have shape {times.shape}, and depth {count} images",
             where="timestamps",
-            remedy="use seconds",
+            remedy="pass one for each image, in seconds",
+        )
+    is_wrong = ~np.isfinite(times)
+    is_wrong[1:] |= ~(np.diff(times) > 0)
+    if is_wrong.any():
+        k = int(is_wrong.argmax())
+        raise InputError(
+            f"are not numbers that ascend: that of image {k} is {given[k]!s}",
+            where="timestamps",
+            remedy="use seconds, and leave out images that repeat",
         )
     if is_number and count > 1:
         _check_seconds(np.diff(times))

@@ -46,8 +46,10 @@ class KdTree:
         index, distance2 = self._search(queries, 1, max_distance)
         return index[:, 0], distance2[:, 0]
 
-    def neighbours(self, queries: ArrayLike, k: int) -> tuple[Int64, Float64]:
-        """Find the `k` nearest points of each query (M, 3), nearest first.
+    def neighbours(
+        self, queries: ArrayLike, k: int, max_distance: float = np.inf
+    ) -> tuple[Int64, Float64]:
+        """Find the `k` nearest points of each query (M, 3), nearest first, as far as `nearest`.
 
         A query that is itself one of the points finds itself, or one at the same place. Returns
         index (M, k), -1 where there are fewer than k points, and squared distance (M, k) in m^2,
@@ -55,7 +57,7 @@ class KdTree:
         """
         if k < 1:
             raise ValueError("k must be at least 1")
-        return self._search(queries, k, np.inf)
+        return self._search(queries, k, max_distance)
 
     def _search(self, queries: ArrayLike, k: int, max_distance: float) -> tuple[Int64, Float64]:
         """Indices and squared distances (M, k); a query that is not finite has no neighbours."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -86,7 +86,7 @@ class Mapper:
         if self.threads > 1:
             ahead.load_in_background()
         self.watch = current()
-        self._prior_loops, self._surface = _prior_loops(loops), surface
+        self._prior_loops, self._surface = prior_loops(loops), surface
         if progress and not hasattr(progress, "began"):
             remedy = "pass an object that receives it; `reconstruct` shows it on the terminal"
             raise InputError(f"is {progress!r}", where="progress", remedy=remedy)
@@ -346,12 +346,26 @@ class Mapper:
             raise InputError("is finished", where="mapper", remedy="make a new Mapper")
 
 
-def _prior_loops(loops: Sequence[PriorLoop | Sequence[Any]]) -> tuple[PriorLoop, ...]:
+def prior_loops(
+    loops: Sequence[PriorLoop | Sequence[Any]], frames: Collection[int] | None = None
+) -> tuple[PriorLoop, ...]:
+    """Return the loops that the user gives, of the indices of existing `frames`, if known.
+
+    Raises
+    ------
+    InputError
+        If one is not a loop, or joins a frame that doesn't exist.
+    """
     if not isinstance(loops, Sequence) or isinstance(loops, str):
         raise InputError(
             f"is a {type(loops).__name__}", where="loops", remedy="pass a list of pairs (i, j)"
         )
-    return tuple(PriorLoop.of(loop) for loop in loops)
+    found = tuple(PriorLoop.of(loop) for loop in loops)
+    for index in (index for loop in found for index in (loop.i, loop.j)):
+        if frames is not None and index not in frames:
+            remedy = "use indices of frames, counted before any selection"
+            raise InputError(f"there is no frame {index}", where="loops", remedy=remedy)
+    return found
 
 
 def _odometry(T: ArrayLike | None) -> Float64 | None:

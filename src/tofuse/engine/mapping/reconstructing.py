@@ -19,7 +19,7 @@ from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.color_frames import ColorFrames
 from tofuse.engine.mapping.config import Config, ViewKind, kind_of
 from tofuse.engine.mapping.frame_log import FrameLog
-from tofuse.engine.mapping.mapper import Mapper
+from tofuse.engine.mapping.mapper import Mapper, prior_loops
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.self_calibration import self_calibrated
 from tofuse.engine.progress import Progress, Silent
@@ -83,10 +83,11 @@ def reconstruct(
     Raises
     ------
     InputError
-        If no frame can be read, or none has enough valid points for a pose; or if a filter can't
-        learn from the recording.
+        If no frame can be read, or none has enough valid points for a pose; if a loop is of frames
+        that don't exist; or if a filter can't learn from the recording.
     """
     progress = progress or Silent()
+    loops = prior_loops(loops, set(recording.indices.tolist()))
 
     def reconstruct_with(config: Config, tracked_frames: TrackedFrames | None) -> Reconstruction:
         # BLAS results depend on its number of threads; those of our kernels don't.

@@ -415,6 +415,12 @@ def lens(message: Any, where: str, *, rectified: bool = False) -> Pinhole:
     P = np.asarray(getattr(message, "p", getattr(message, "P", ())), float)
     if rectified and P.shape == (12,) and P[0] > 0 and P[5] > 0:
         return camera_file.checked_pinhole(P.reshape(3, 4), info.size, where)
+    if info.values["fx"] == 0:  # by ROS's convention
+        raise InputError(
+            "is of a camera that is not calibrated (K is zero)",
+            where=where,
+            remedy="pass the depth camera with --camera camera.json",
+        )
     name = "pinhole"
     if any(D):
         if model in ("equidistant", "fisheye"):

@@ -54,6 +54,7 @@
       grid: { stroke: color("grid"), width: 0.8 }, ticks: { stroke: color("muted"), width: 0.8, size: 3 },
       values: (chart, splits) => splits.map((value) => text(value)),
     };
+    const whole = [1, 2, 5].flatMap((k) => [k, 10 * k, 100 * k, 1e3 * k, 1e4 * k]).sort((a, b) => a - b);
     const lines = names.map((name) => (
       { stroke: color(name), width: 1.6, dash: name === "before" ? [6, 3] : undefined, points: { size: 4, fill: color(name) } }
     ));
@@ -67,7 +68,7 @@
         y: { ...c.scale, range: range(c) },
       },
       axes: [
-        { ...axis, label: c.xlabel, labelSize: 16, size: 22, gap: 3, incrs: [1, 2, 5].flatMap((k) => [k, 10 * k, 100 * k, 1e3 * k, 1e4 * k]).sort((a, b) => a - b) },
+        { ...axis, label: c.xlabel, labelSize: 16, size: 22, gap: 3, ...(c.x.every(Number.isInteger) ? { incrs: whole } : {}) },
         { ...axis, size: 48, gap: 3, space: 34 },
       ],
       series: [{}, ...lines],
