@@ -135,6 +135,8 @@ def test_frames_beyond_degenerate_tracking_are_aligned_with_the_map(
             assert "does not constrain" in frame.reason
             assert len(frame.location.unobservable) == 1
             assert se3.largest_sigmas(frame.location.covariance)[0] > 1
+        # The width of the prior is no error of a pose.
+        assert ("sigma" in locating.sentence(frame)) == frame.accepted
 
 
 def test_motion_in_a_clip_knows_what_tracking_did_not_constrain() -> None:

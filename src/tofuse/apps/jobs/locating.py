@@ -328,7 +328,7 @@ def sentence(frame: LocatedFrame) -> str:
             f"at {pair_words.vector(T[:3, 3], 3)} m, rotation {pair_words.vector(rotation, 1)} deg"
         )
         sigma_m, sigma_rad = se3.largest_sigmas(location.covariance).tolist()
-        if np.isfinite(sigma_m):
+        if np.isfinite(sigma_m) and not len(location.unobservable):
             words.append(f"sigma {1e3 * sigma_m:.0f} mm, {np.degrees(sigma_rad):.2f} deg")
         words.append(f"probability {min(location.probability, _MAX_STATED):.1%}")
         if location.runner_up is not None:
