@@ -246,7 +246,10 @@ def _connections(e: Evidence) -> Iterator[Reason]:
             f"The recording consists of {len(parts)} disconnected parts: {_listed(parts)}; no "
             "pose between them could be verified.",
         )
-    for joined_by, motion in (("motion", "extrapolated motion"), ("odometry", "recorded odometry")):
+    for joined_by, motion in (
+        ("motion", "extrapolated motion"),
+        ("odometry", "recorded odometry or the device's poses"),
+    ):
         bridged = frame_ranges.union(
             r for c in e.components if c.joined == joined_by for r in c.frames
         )
@@ -512,7 +515,7 @@ def accuracy_reasons(
             "bounded_by_odometry",
             a.by_odometry,
             "not constrained by the images in some direction (degenerate "
-            "geometry): the recorded odometry bounds the error there.",
+            "geometry): the recorded odometry, or the device's own poses, bound the error there.",
         ),
         (
             "bounded_by_motion",

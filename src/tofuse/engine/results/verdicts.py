@@ -53,7 +53,10 @@ REASONS: dict[str, tuple[str, str]] = {
     "not_improved": ("note", "The optimiser did not improve on the initial poses."),
     "not_refined": ("note", "Global refinement did not improve consistency and was discarded."),
     "sensor_differs": ("note", "An external sensor is inconsistent with the tracked motion."),
-    "bounded_by_odometry": ("note", "Only the recorded odometry constrains the motion there."),
+    "bounded_by_odometry": (
+        "note",
+        "Only recorded odometry, or the device's poses, constrain the motion.",
+    ),
     "bounded_by_motion": ("note", "Only the motion before and after constrains some poses."),
     "unreadable_frames": ("note", "Some frames could not be read and were skipped."),
     "single_frame": ("degraded", "Single view: nothing to register, accuracy not assessed."),
