@@ -142,6 +142,12 @@ RECORDED = {
             object=True,
         ),
         Recorded(
+            "cases/person_fills_view",
+            "somebody near fills the view",
+            _folder("cases/person_fills_view"),
+            _still,
+        ),
+        Recorded(
             "sr4000_corridor", "SR4000, corridor, 176 x 144", _folder("sr4000_corridor"), _corridor
         ),
         Recorded(

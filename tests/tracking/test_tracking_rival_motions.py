@@ -13,6 +13,7 @@ from tofuse.engine.tracking.keyframes import Keyframes
 from tofuse.engine.tracking.rival_motions import STANDS, STOOD, Rival, RivalMotions, Rivalry
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
+from tofuse.formats.recordings.open import open_recording
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 140.0
 CAMERA = Pinhole(WIDTH, HEIGHT, FOCAL, FOCAL, 79.5, 59.5)
@@ -126,3 +127,12 @@ def test_camera_that_moves_does_not_stand_since_long_ago() -> None:
     rivals.compare(views[2], away, others, 1.0)
     rivals.compare(views[3], away, others, 1.0)
     assert rivals.stood_since is now
+
+
+def test_real_person_who_fills_the_view_is_noticed(shared_data) -> None:
+    """The camera stands; its background, a quarter of the view, is three times as far away."""
+    tracker = Keyframes().start(0)
+    steps = [tracker.push(f) for f in open_recording(shared_data / "cases/person_fills_view")]
+    moved = [np.linalg.norm(step.T_component_camera[:3, 3]) for step in steps]
+    assert max(moved) < 0.1
+    assert max(step.rival for step in steps) > 0.5
