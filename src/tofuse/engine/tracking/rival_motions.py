@@ -129,10 +129,14 @@ class RivalMotions:
         if self._views % _EVERY != 1:
             return Rivalry(self._share)
         self._share, winner, rest = 0.0, "", 0.0
+        tracked_from: dict[int, _Tracked] = {}
         for name, (keyframe, T_rival) in rivals.items():
             T_keyframe_component = se3.inverse(keyframe.T_component_camera)
             T, T_rival = T_keyframe_component @ T_component_camera, T_keyframe_component @ T_rival
-            tracked = _Tracked(view, keyframe.view, T, scale)
+            tracked = tracked_from.get(keyframe.view.index)
+            if tracked is None:  # else the comparison at the tracked motion is known
+                tracked = _Tracked(view, keyframe.view, T, scale)
+                tracked_from[keyframe.view.index] = tracked
             window = self._windows.setdefault(name, deque(maxlen=_WINDOW))
             window.append(tracked.histograms(T_rival, shortcut=name != STOOD))
             if name == STOOD and (tracked.refutes(window[-1]) or not tracked.overlaps):
