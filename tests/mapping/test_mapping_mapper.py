@@ -153,6 +153,13 @@ def test_no_frames_and_no_usable_frames_are_refused(frames) -> None:
         mapper.finish()
 
 
+def test_depth_in_mm_is_named(frames) -> None:
+    mapper = Mapper()
+    mapper.push(replace(frames[0], depth=1000 * frames[0].depth))
+    with pytest.raises(InputError, match=r"depth must be in m; here it is \d{4} m"):
+        mapper.finish()
+
+
 def test_filter_for_images_refuses_clouds_early(frames) -> None:
     config = replace(CONFIG, filters=(TemporalDeviation(),))
     mapper = Mapper(config)

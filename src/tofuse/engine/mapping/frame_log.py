@@ -20,6 +20,8 @@ from tofuse.engine.stored_views import ViewStore
 from tofuse.engine.tracking import Step
 from tofuse.engine.views import PreparedView
 
+_FAR_M = 100.0  # no depth camera measures as far
+
 
 class FrameSequence:
     """Checks the order and the kind of frames as they arrive, and detects repeated images.
@@ -162,11 +164,15 @@ class FrameLog:
         """Raise InputError if no frame has a pose."""
         if not self.posed:
             entries = self.entries
+            remedy = "check it with `tofuse inspect`, and the limits of depth and the filters"
+            depths = [e.record.mean_depth_m or 0.0 for e in entries]
+            if depths and np.nanmedian(depths) > _FAR_M:
+                remedy = f"depth must be in m; here it is {np.nanmedian(depths):.0f} m on average"
             raise InputError(
                 f"none of the {len(entries)} frames has enough valid points for a pose"
                 + (f" (first: {entries[0].record.reason})" if entries else ""),
                 where="the recording",
-                remedy="check it with `tofuse inspect`, and the limits of depth and the filters",
+                remedy=remedy,
             )
 
     @property
