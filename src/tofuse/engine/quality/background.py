@@ -4,29 +4,23 @@ Where something that moves covers much of the view, consecutive views can't tell
 Views from other times, in which nothing moves, can: at the right poses they have the same
 background around it, and neither sees through a surface of the other. So a frame is confirmed if
 more of it lies on surfaces of such views than moves, and if no more contradicts them than may move
-in a view without leaving the choice open. A confirmed frame helps to confirm others. All must hang
-together by pairs that agree: of two parts that don't, each may have followed what moves.
+in a view without leaving the choice open. A confirmed frame helps to confirm others. All must
+be connected by pairs that agree: of two parts that aren't, either may have followed what moves.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csgraph
 
 from tofuse.engine.arrays import Bool, Float64, Intp
-from tofuse.engine.compute import run_all
-from tofuse.engine.geometry import se3
-from tofuse.engine.search import pair_agreement
+from tofuse.engine.quality import cross_view_agreement
 from tofuse.engine.views import PreparedView
-
-_OPTIONS = pair_agreement.AgreementOptions(points=700)
-# Pairs with less overlap are left out.
-_MIN_OVERLAP = 0.2
 
 
 class Movement(NamedTuple):
@@ -40,8 +34,8 @@ class Movement(NamedTuple):
         Follows a rival of the tracked motion; it was not excluded.
     """
 
-    excluded: float
-    rival: float
+    excluded: float = 0.0
+    rival: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -90,7 +84,7 @@ def confirmed(
     is_still = np.isin(indices, list(still))
     if len(still) <= len(open_frames) or is_still.all() or not is_still.any():
         return frozenset()
-    shares = np.array([movements.get(k, (0.0, 0.0)) for k in indices.tolist()])
+    shares = np.array([movements.get(k, Movement()) for k in indices.tolist()])
     pairs = _Pairs.of([views[k] for k in used], poses[used], limits.max_share)
     found = pairs.confirmed(is_still, shares)
     return _extended(open_frames, indices[~is_still], found[~is_still])
@@ -103,10 +97,10 @@ def _still(
     limits: Limits,
 ) -> set[int]:
     """Return the frames in which nothing moves."""
-    indices, nothing = np.asarray(frames), Movement(0.0, 0.0)
+    indices = np.asarray(frames)
     still = ~np.isin(indices, list(open_frames))
     for k, index in enumerate(frames):
-        movement = movements.get(index, nothing)
+        movement = movements.get(index, Movement())
         still[k] &= movement.excluded == 0
         if movement.rival > limits.max_share:
             still &= np.abs(indices - index) > limits.delay
@@ -134,30 +128,16 @@ class _Pairs:
 
     @classmethod
     def of(cls, views: Sequence[PreparedView], poses: Float64, max_share: float) -> _Pairs:
-        of = pair_agreement.ComparedView.of
-        prepared = run_all([partial(of, view, _OPTIONS) for view in views])
-
-        def compared(i: int, j: int) -> tuple[float, float, Bool, Bool]:
-            T = se3.inverse(poses[j]) @ poses[i]
-            both = pair_agreement.Comparison(prepared[i], prepared[j], _OPTIONS).at(T)
-            on_j = pair_agreement.supported(prepared[i], prepared[j], T, _OPTIONS)
-            on_i = pair_agreement.supported(prepared[j], prepared[i], se3.inverse(T), _OPTIONS)
-            return both.support, both.violation + both.clash, on_j, on_i
-
         n = len(views)
         support, contradiction, supported = np.zeros((n, n)), np.zeros((n, n)), {}
-        axes = poses[:, :3, 2]
-        pairs = np.argwhere(np.triu(axes @ axes.T > 0, 1)).tolist()
-        found = run_all([partial(compared, i, j) for i, j in pairs])
-        for (i, j), (for_it, against, on_j, on_i) in zip(pairs, found, strict=True):
-            if for_it + against > _MIN_OVERLAP:
-                support[i, j] = support[j, i] = for_it
-                contradiction[i, j] = contradiction[j, i] = against
-                supported[i, j], supported[j, i] = on_j, on_i
+        for i, j, both, of_i, of_j in cross_view_agreement.overlapping_pairs(views, poses):
+            support[i, j] = support[j, i] = both.support
+            contradiction[i, j] = contradiction[j, i] = both.violation + both.clash
+            supported[i, j], supported[j, i] = of_i, of_j
         return cls(support, contradiction, supported, max_share)
 
     def confirmed(self, still: Bool, shares: Float64) -> Bool:
-        """Return the views (V,) that hang together: still ones, and those that they confirm.
+        """Return the connected views (V,): still ones, and those that they confirm.
 
         Parameters
         ----------

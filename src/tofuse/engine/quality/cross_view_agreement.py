@@ -12,12 +12,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tofuse.engine.arrays import Float64
+from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.compute import run_all
 from tofuse.engine.frames import RangeFrame, evenly_spaced
 from tofuse.engine.geometry import se3
@@ -54,6 +55,13 @@ class PairConsistency:
     support: float
     contradiction: float
     squares: float
+
+    @classmethod
+    def of(cls, i: int, j: int, a: pair_agreement.Agreement) -> PairConsistency:
+        """Count the points; a surface of another albedo is one, too."""
+        support = (a.support + a.clash) * a.points
+        squares = a.rms_m**2 * support if support else 0.0
+        return cls(i, j, support, a.violation * a.points, squares)
 
 
 @dataclass(frozen=True)
@@ -142,6 +150,25 @@ def compare_views(
     groups
         Group of each view: pairs within a group are left out. By default all pairs are compared.
     """
+    found = overlapping_pairs(views, poses, groups)
+    pairs = tuple(PairConsistency.of(p.i, p.j, p.agreement) for p in found)
+    return CrossViewConsistency(tuple(v.index for v in views), pairs)
+
+
+class ComparedPair(NamedTuple):
+    """Two views, i < j, their agreement, and which points (n,) lie on surfaces of the other."""
+
+    i: int
+    j: int
+    agreement: pair_agreement.Agreement
+    of_i: Bool
+    of_j: Bool
+
+
+def overlapping_pairs(
+    views: Sequence[PreparedView], poses: Float64, groups: Sequence[int] | None = None
+) -> list[ComparedPair]:
+    """Compare all pairs of views that overlap; the parameters are those of `compare_views`."""
     options = pair_agreement.AgreementOptions(points=_POINTS)
     axes = poses[:, :3, 2]
     # Cameras with opposite viewing directions observe no surface from the same side.
@@ -151,16 +178,13 @@ def compare_views(
 
     prepared = run_all([partial(pair_agreement.ComparedView.of, v, options) for v in views])
 
-    def compared(i: int, j: int) -> PairConsistency | None:
+    def compared(i: int, j: int) -> ComparedPair | None:
         T_i_j = se3.inverse(poses[i]) @ poses[j]
-        a = pair_agreement.Comparison(prepared[j], prepared[i], options).at(T_i_j)
-        support, contradiction = (a.support + a.clash) * a.points, a.violation * a.points
-        if not support + contradiction > _MIN_OVERLAP * a.points:
+        pair = pair_agreement.Comparison(prepared[j], prepared[i], options)
+        a, of_j, of_i = pair.with_points(T_i_j)
+        if not a.support + a.clash + a.violation > _MIN_OVERLAP:
             return None
-        squares = a.rms_m**2 * support if support else 0.0
-        return PairConsistency(i, j, support, contradiction, squares)
+        return ComparedPair(i, j, a, of_i, of_j)
 
-    pairs = run_all([partial(compared, i, j) for i, j in np.argwhere(np.triu(facing, 1)).tolist()])
-    return CrossViewConsistency(
-        tuple(v.index for v in views), tuple(pair for pair in pairs if pair is not None)
-    )
+    found = run_all([partial(compared, i, j) for i, j in np.argwhere(np.triu(facing, 1)).tolist()])
+    return [pair for pair in found if pair is not None]

@@ -162,11 +162,15 @@ class Comparison:
 
     def at(self, T_target_source: Float64) -> Agreement:
         """Return the agreement at a pose (4, 4); see `agreement`."""
+        return self.with_points(T_target_source)[0]
+
+    def with_points(self, T_target_source: Float64) -> tuple[Agreement, Bool, Bool]:
+        """Return the agreement at a pose, and which points of either lie on the other's surface."""
         options = self.options
         T = np.ascontiguousarray(T_target_source, np.float64)
         total = np.zeros(kernels.AGREEMENT_SIZE)
         count = 0
-        differences = []
+        differences, supporting = [], []
         # The signs of the differences change with the direction.
         for source, target, pose, sign in (
             (self.source, self.target, T, 1),
@@ -174,9 +178,10 @@ class Comparison:
         ):
             points = source.points
             count += len(points.points)
-            log_albedos = np.empty((2, len(points.points)), np.float32)
+            log_albedos = np.full((2, len(points.points)), np.nan, np.float32)
             pose = np.ascontiguousarray(pose)
             total += _one_direction(points, target, pose, options, log_albedos)
+            supporting.append(np.isfinite(log_albedos[1]))  # also without albedo
             differences.append(sign * log_albedos[:, np.isfinite(log_albedos[0])])
         on_surface, violation = total[kernels.SUPPORT], total[kernels.VIOLATION]
         albedo_ratio, slants = np.hstack(differences)
@@ -192,7 +197,7 @@ class Comparison:
             clash = int(np.count_nonzero(ratio > _CLASH_RATIO))
             consistent -= float(np.minimum(ratio**2, 1 + _CLASH_WEIGHT).sum(dtype=np.float64))
         per_point = 1 / max(count, 1)
-        return Agreement(
+        found = Agreement(
             overlap=float(total[kernels.COMPARED] * per_point),
             support=float((on_surface - clash) * per_point),
             violation=float(violation * per_point),
@@ -202,16 +207,7 @@ class Comparison:
             score=float(per_point * (consistent - _VIOLATION_WEIGHT * violation)),
             falloff=falloff,
         )
-
-
-def supported(
-    source: ComparedView, target: ComparedView, T_target_source: Float64, options: AgreementOptions
-) -> Bool:
-    """Return which points of a view (n,) lie on a surface of another at a pose (4, 4)."""
-    written = np.full((2, len(source.points.points)), np.nan, np.float32)
-    T = np.ascontiguousarray(T_target_source)
-    _one_direction(source.points, target, T, options, written)
-    return np.isfinite(written[1])
+        return found, supporting[0], supporting[1]
 
 
 def nearest_depth(view: PreparedView) -> Float32:

@@ -5,8 +5,8 @@ person near the camera may fill most of the image. So the motion of each view is
 rivals: that the camera stands still, and that it goes on as before. Parts of the view that both
 explain say nothing. Elsewhere each cell yields a likelihood ratio: of depth, or of the pattern of
 the albedo on surfaces that both motions map onto themselves. As what is near may move slowly, and
-what is far then shows it only in the long run, a third rival is that the camera stands since the
-first view of which nothing has refuted that.
+what is far then shows it only in the long run, a third rival is that the camera has stood still
+since an earlier view, as long as nothing refutes it.
 
 The shares of the view that follow either motion are those of the mixture of both with the largest
 likelihood, over a window of frames. They are counted by solid angle and by area of surface: what is
