@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.frames import RangeFrame
 from tofuse.engine.fusion import display_surface
 from tofuse.engine.fusion.display_surface import Witness, boundary_loops, triangulated
 from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.fusion.texture import TextureView
 from tofuse.engine.geometry import se3
 
 CAMERA = Pinhole(160, 120, 140.0, 140.0, 79.5, 59.5)
@@ -166,3 +168,22 @@ def test_triangles_cover_polygon(seed):
 
 def test_polygon_that_crosses_itself_has_no_triangles():
     assert triangulated(np.array([[0.0, 0], [1, 1], [1, 0], [0, 1.2]])) is None
+
+
+def test_depth_of_large_images_is_reduced_where_they_see_it() -> None:
+    """A step at column 500 of 1000 is at the same place, for what is seen and what is painted."""
+    camera = Pinhole(1000, 200, 800.0, 800.0, 499.5, 99.5)
+    z = np.where(np.arange(1000) < 500, 1.0, 3.0)[None].repeat(200, 0).astype(np.float32)
+    color = np.full((200, 1000, 3), 100, np.uint8)
+    frame = RangeFrame(0, 0.0, camera, z, color_image=color, color_registered=True)
+    beside = np.array([[-0.006, 0.0, 1.0], [0.018, 0.0, 3.0], [0.018, 0.0, 1.0]])
+    inside, behind = Witness.of(frame, np.eye(4)).looks(beside)
+    assert inside.all()
+    assert np.abs(behind[:2]).max() < 1e-3 < 1 < behind[2]
+    view = TextureView.of(frame)
+    assert view is not None
+    assert view.z.shape == view.known.shape == view.projection.rays.shape[:2] == (50, 250)
+    assert view.image.shape == color.shape
+    assert (view.z[0, :125] == 1).all()
+    assert (view.z[0, 125:] == 3).all()
+    assert abs(view.projection.rays[0, 124:126, 0].mean()) < 1e-6

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from tofuse.engine.arrays import Bool, Float32, Float64, Intp, UInt8
+from tofuse.engine.arrays import Bool, Float32, Float64, Int16, Intp, UInt8
 from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
 from tofuse.engine.views import Projection
@@ -21,6 +21,7 @@ _MAX_SIDE = 480  # pixels of the compared images
 # Blur of the images in pixels, and iterations at each; the width of the neighbourhood in which
 # contrast is equalised, in blurs; and the contrast of noise, in grey levels.
 _BLURS, _ITERATIONS, _NEIGHBOURHOOD, _NOISE = (3.0, 1.0), 5, 8, 3.0
+_UNIT = 1000.0  # of contrast in whole numbers
 _ROBUST_LIMIT = 1.0  # of differences between images of unit contrast
 # Expected corrections in m and radians: of poses that were estimated from depth. Those of more
 # than `_MAX_SIGMAS` are not made.
@@ -73,9 +74,9 @@ def aligned_poses(points: Float32, poses: Float64, shown: Sequence[Shown]) -> Fl
     )
     tested = np.arange(len(chosen)) % 4 == 3
     xi = np.zeros((len(views), 6))
-    signals: list[Float32] = []
+    signals: list[Int16] = []
     for blur in _BLURS:
-        signals.clear()  # before there are others: they take 2 MB a view
+        signals.clear()  # before there are others: they take 1 MB a view
         signals += run_all([partial(view.signal, blur) for view in views])
         for _ in range(_ITERATIONS):
             for k, (row, error, slope) in enumerate(_differences(views, signals, xi, ~tested)):
@@ -134,17 +135,18 @@ class _View:
         factor = np.array(size) / rays.shape[1::-1]
         return cls(grey, rows, (pixels + 0.5) * factor - 0.5, slope * factor[:, None])
 
-    def signal(self, blur: float) -> Float32:
-        """(h, w, 3) the blurred image in units of the contrast around, and its derivatives."""
+    def signal(self, blur: float) -> Int16:
+        """(h, w, 3) times `_UNIT`: the blurred image by the contrast around it, and its slopes."""
         image = cv2.GaussianBlur(self.grey, (0, 0), blur)
         size = (round(_NEIGHBOURHOOD * blur) + 1,) * 2
         mean = cv2.blur(image, size)
         variance = np.maximum(cv2.blur(image * image, size) - mean * mean, 0)
-        unit = (image - mean) / np.sqrt(variance + _NOISE**2)
+        unit = (image - mean) * (_UNIT / np.sqrt(variance + _NOISE**2))
         slopes = (cv2.Scharr(unit, cv2.CV_32F, *axis, scale=1 / 32) for axis in ((1, 0), (0, 1)))
-        return np.asarray(cv2.merge([unit, *slopes]), np.float32)
+        # Half the memory: no pixel differs by more than the edge of the neighbourhood in contrasts.
+        return np.asarray(np.rint(cv2.merge([unit, *slopes])), np.int16)
 
-    def sampled(self, signal: Float32, twist: Float64, used: Bool) -> tuple[Intp, Float64, Float64]:
+    def sampled(self, signal: Int16, twist: Float64, used: Bool) -> tuple[Intp, Float64, Float64]:
         """Return the used points (K,), and there `signal` (K, 3) and the derivatives (K, 2, 6)."""
         own = used[self.rows]
         rows, slope = self.rows[own], self.slope[own]
@@ -152,11 +154,11 @@ class _View:
             return rows, np.zeros((0, 3)), slope
         u, v = (self.pixels[own] + slope @ twist).astype(np.float32).T
         values = cv2.remap(signal, u, v, cv2.INTER_LINEAR)
-        return rows, values.reshape(-1, 3).astype(float), slope
+        return rows, values.reshape(-1, 3).astype(float) / _UNIT, slope
 
 
 def _differences(
-    views: Sequence[_View], signals: Sequence[Float32], xi: Float64, used: Bool
+    views: Sequence[_View], signals: Sequence[Int16], xi: Float64, used: Bool
 ) -> list[tuple[Intp, Float64, Float64]]:
     """Return the used points (K,) of each view that others show too, and how these differ.
 

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64, Intp
 from tofuse.engine.cameras import Camera
@@ -24,6 +25,9 @@ from tofuse.engine.geometry import se3
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
+_Pixel = TypeVar("_Pixel", np.float32, np.bool_)
+# Columns of depth images that tell what is seen: whole ones tell no more, but fill the memory.
+_MAX_COLUMNS = 480
 # Depth tolerance of the visibility test: m, plus a fraction of the depth.
 TOLERANCE_M, TOLERANCE_FRACTION = 0.02, 0.02
 # Vertices are supported by this fraction of the usual number of views, of those that look at them;
@@ -49,7 +53,7 @@ class Witness:
     Attributes
     ----------
     z
-        (H, W) m, 0 where unknown.
+        (H, W) m, 0 where unknown, as of `reduced`.
     camera, T_world_camera
         The camera and its pose.
     """
@@ -61,7 +65,8 @@ class Witness:
     @classmethod
     def of(cls, frame: RangeFrame, T_world_camera: Float64) -> Witness:
         """Take the depth of a frame at its pose."""
-        return cls(np.nan_to_num(np.asarray(frame.z, np.float32)), frame.camera, T_world_camera)
+        z = np.nan_to_num(np.asarray(frame.z, np.float32))
+        return cls(reduced(z, reduction(z)), frame.camera, T_world_camera)
 
     def looks(self, points: Float64, normals: Float64 | None = None) -> tuple[Bool, Float64]:
         """Return which points (N, 3) are in the image, from the front; and what is seen there.
@@ -75,8 +80,9 @@ class Witness:
         if normals is not None:
             inside &= ((normals @ T[:3, :3].T) * p).sum(1) < 0
         rows = np.flatnonzero(inside)
-        pixels = np.rint(self.camera.project(p[rows]))
         height, width = self.z.shape
+        step = self.camera.width // width
+        pixels = np.rint((self.camera.project(p[rows]) + 0.5) / step - 0.5)
         within = ((pixels >= 0) & (pixels < [width, height])).all(1)  # NaN is not
         inside[rows[~within]] = False
         u, v = pixels[within].astype(np.intp).T
@@ -85,6 +91,19 @@ class Witness:
         tolerance = TOLERANCE_M + TOLERANCE_FRACTION * seen
         behind[inside] = np.where(seen > 0, (seen - p[inside, 2]) / tolerance, np.nan)
         return inside, behind
+
+
+def reduction(z: Float32) -> int:
+    """Return by which power of two images of depth (H, W) are subsampled to tell what is seen."""
+    step = 1
+    while z.shape[1] > _MAX_COLUMNS * step and not any(n % (2 * step) for n in z.shape):
+        step *= 2
+    return step
+
+
+def reduced(image: NDArray[_Pixel], step: int) -> NDArray[_Pixel]:
+    """Return the pixel at the middle of each `step` x `step` of an image; a copy, to free it."""
+    return image if step == 1 else image[step // 2 :: step, step // 2 :: step].copy()
 
 
 def displayed(mesh: Mesh, witnesses: Sequence[Witness]) -> tuple[Mesh, int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +22,7 @@ UNKNOWN_M = 10.0
 
 
 def with_pose_errors(
-    model: Model, frames: Sequence[RangeFrame], poses: Float64, covariances: Float64
+    model: Model, frames: Iterable[RangeFrame], poses: Float64, covariances: Float64
 ) -> Model:
     """Return the model with errors of the poses in the `sigma` of its points.
 
@@ -37,7 +37,7 @@ def with_pose_errors(
         pose is unconstrained.
     """
     cloud, mesh = model.cloud, model.mesh
-    if cloud.sigma is None or not len(cloud) or not len(frames):
+    if cloud.sigma is None or not len(cloud) or not len(poses):
         return model
     cells = _SurfaceCells.of(cloud)
     pose_sigma = _cell_sigma(cells, frames, poses, covariances)
@@ -72,7 +72,7 @@ class _SurfaceCells:
 
 
 def _cell_sigma(
-    cells: _SurfaceCells, frames: Sequence[RangeFrame], poses: Float64, covariances: Float64
+    cells: _SurfaceCells, frames: Iterable[RangeFrame], poses: Float64, covariances: Float64
 ) -> Float64 | None:
     """Return sigma (M,) of each cell, the minimum over the views; None if no cell is visible."""
     world = cells.points

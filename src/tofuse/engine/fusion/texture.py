@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, UInt8
-from tofuse.engine.cameras import ray_lengths
+from tofuse.engine.cameras import Camera, ray_lengths
 from tofuse.engine.compute import job_pool, run_all, run_chunks
 from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.fusion.atlas import MARGIN, Atlas, chart_atlas, unwrap
@@ -27,7 +27,12 @@ from tofuse.engine.fusion.atlas_kernels import (
 )
 from tofuse.engine.fusion.cloud import NO_COLOR, grey_of, has_color
 from tofuse.engine.fusion.color_alignment import Shown, aligned_poses
-from tofuse.engine.fusion.display_surface import TOLERANCE_FRACTION, TOLERANCE_M
+from tofuse.engine.fusion.display_surface import (
+    TOLERANCE_FRACTION,
+    TOLERANCE_M,
+    reduced,
+    reduction,
+)
 from tofuse.engine.fusion.drawing import display_colors
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.geometry import KdTree, se3
@@ -118,20 +123,24 @@ class TextureView:
         None if it has neither.
         """
         z = np.nan_to_num(np.asarray(frame.z, np.float32))
-        projection = projection_of(frame.camera, 1)
         if frame.color_image is not None and frame.color_registered:
             image = frame.color_image if image is None else image
             # Else the colour camera didn't see it.
             red, green, blue = np.moveaxis(frame.color_image, -1, 0)
             known = np.asarray((red | green | blue) > 0, np.bool_)
-            return cls(z, known, np.ascontiguousarray(image), projection)
+            return cls._reduced(z, known, np.ascontiguousarray(image), frame.camera)
         light = albedo(frame)
         if light is None:
             return None
         known = np.asarray(light >= 0, np.bool_)
         image = np.zeros((*z.shape, 3), np.uint8)
         image[known] = grey_of(light[known].astype(float))
-        return cls(z, known, image, projection)
+        return cls._reduced(z, known, image, frame.camera)
+
+    @classmethod
+    def _reduced(cls, z: Float32, known: Bool, image: UInt8, camera: Camera) -> TextureView:
+        step = reduction(z)
+        return cls(reduced(z, step), reduced(known, step), image, projection_of(camera, step))
 
     @property
     def reach(self) -> Float32:
@@ -295,14 +304,14 @@ class _Seen:
         """
         step = max(1, -(-self.weights.shape[1] // _MAX_SAMPLES))
         weights = (self.weights[:, ::step] > 0).astype(float)
-        colors = np.zeros((*weights.shape, 3))
+        colors = np.zeros((*weights.shape, 3), np.float32)
         for view, pixels, color in zip(self.views, self.pixels[:, ::step], colors, strict=True):
             u, v = pixels.T[:, None]
             sampled = cv2.remap(view.small.astype(np.float32), u, v, cv2.INTER_LINEAR)
             color[:] = sampled.reshape(-1, 3)
         weights *= ((colors > _MIN_INTENSITY) & (colors < _MAX_INTENSITY)).all(-1)
-        logs = np.log(np.maximum(colors, _MIN_INTENSITY))
-        return np.stack([_gains(logs[..., c], weights) for c in range(3)], -1)
+        logs = np.log(np.maximum(colors, np.float32(_MIN_INTENSITY)))
+        return np.stack([_gains(logs[..., c].astype(float), weights) for c in range(3)], -1)
 
     def candidates(self, faces: Int32) -> tuple[Int32, Int32]:
         """Return the best views (M, K) of each triangle, best first, and the best whole one (M,).

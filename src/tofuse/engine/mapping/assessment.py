@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.compute import run_all
-from tofuse.engine.frames import RangeFrame, frame_ranges
+from tofuse.engine.frames import frame_ranges
 from tofuse.engine.fusion import Model, with_pose_errors
 from tofuse.engine.graph import LoopRecord, PoseGraph, external_sensors, graph_covariances
 from tofuse.engine.loops import PriorLoop, cut_edges
 from tofuse.engine.mapping import camera_uncertainty
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.frame_log import FrameLog
-from tofuse.engine.mapping.observations import Observations
+from tofuse.engine.mapping.observations import CheckedImage, Observations
 from tofuse.engine.mapping.tracked_graph import Optimised, Refined, TrackedGraph
 from tofuse.engine.parts import name_of
 from tofuse.engine.quality import (
@@ -31,6 +29,7 @@ from tofuse.engine.refinement import Refinement
 from tofuse.engine.results import Component, FrameRecord, Reason, Verdict, checks, verdicts
 from tofuse.engine.sensor import CameraErrors
 from tofuse.engine.tracking import FrameTime, given, moving_objects, rival_motions
+from tofuse.engine.views import PreparedView
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,7 +277,8 @@ class Assessment:
 
     def _with_pose_errors(self, model: Model, graph: PoseGraph, covariances: Float64) -> Model:
         """Add the errors of the poses, with covariances (P, 6, 6), to those of the model."""
-        frames, rows = self._checked_images(graph)
+        images, rows = self._checked_images(graph)
+        frames = (checked.image.get() for checked in images)
         return with_pose_errors(model, frames, graph.poses[rows], covariances[rows])
 
     def _records(self, covariances: Float64) -> tuple[FrameRecord, ...]:
@@ -295,12 +295,8 @@ class Assessment:
 
     def _cross_view(self, graph: PoseGraph) -> cross_view_agreement.CrossViewConsistency | None:
         """Compare overlapping images at the final poses."""
-        frames, rows = self._checked_images(graph)
-        return (
-            cross_view_agreement.cross_view_consistency(frames, graph.poses[rows])
-            if len(frames) > 1
-            else None
-        )
+        views, poses = self._checked_views(graph)
+        return cross_view_agreement.compare_views(views, poses) if len(views) > 1 else None
 
     def _confirmed(
         self,
@@ -313,7 +309,6 @@ class Assessment:
         open_frames = checks.open_motion([*moving, *rivals], measured)
         if not open_frames:
             return frozenset()
-        images, rows = self._checked_images(graph, with_open=True)
         excluded = {k: x for k, x in moving if x > moving_objects.MIN_MOVING_FRACTION}
         rival = dict(rivals)
         movements = {
@@ -321,13 +316,9 @@ class Assessment:
             for k in excluded.keys() | rival.keys()
         }
         limits = background.Limits(checks.MAX_MOVING, rival_motions.DELAY)
-        views = run_all(
-            [partial(cross_view_agreement.prepare_for_comparison, image) for image in images]
-        )
+        views, poses = self._checked_views(graph, with_open=True)
         frames = graph.ids.tolist()
-        return background.confirmed(
-            views, graph.poses[rows], frames, open_frames, movements, limits
-        )
+        return background.confirmed(views, poses, frames, open_frames, movements, limits)
 
     def _ambiguous(self, graph: PoseGraph) -> tuple[int, ...]:
         """Return frames to which another step fits as well; odometry would exclude that."""
@@ -342,18 +333,29 @@ class Assessment:
             views = [*views, newest]
         return ambiguous_frames(views, poses, moments)
 
+    def _checked_views(
+        self, graph: PoseGraph, *, with_open: bool = False
+    ) -> tuple[list[PreparedView], Float64]:
+        """Return what is compared of the images for the final comparison, and their poses.
+
+        One after the other, so that not all images are in memory.
+        """
+        images, rows = self._checked_images(graph, with_open=with_open)
+        prepare = cross_view_agreement.prepare_for_comparison
+        return [prepare(checked.image.get()) for checked in images], graph.poses[rows]
+
     def _checked_images(
         self, graph: PoseGraph, *, with_open: bool = False
-    ) -> tuple[list[RangeFrame], Intp]:
+    ) -> tuple[list[CheckedImage], Intp]:
         """Return the images for the final comparison, and their positions in the graph.
 
         Optionally with those in which so much moves that it is open what stands still.
         """
         images = {*self.observations.checks, *(self.observations.open_checks if with_open else ())}
-        frames = [f for f in (image.get() for image in images) if f.index in self.tracked.poses]
-        frames.sort(key=lambda frame: frame.index)
+        posed = [checked for checked in images if checked.index in self.tracked.poses]
+        posed.sort(key=lambda checked: checked.index)
         row_of = {int(frame): k for k, frame in enumerate(graph.ids)}
-        return frames, np.array([row_of[f.index] for f in frames], np.intp)
+        return posed, np.array([row_of[checked.index] for checked in posed], np.intp)
 
     def _correction_reasons(self) -> tuple[Reason, ...]:
         """Return the reason if a correction was left out."""

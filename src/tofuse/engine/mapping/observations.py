@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import cache, partial
 
 import numpy as np
@@ -31,6 +32,14 @@ _COLUMNS = 200
 _VIEWS_PER_PLACE = 32
 # Bounds memory, as waiting jobs reference frames.
 _MAX_WAITING = 4
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedImage:
+    """An image for the final comparison, possibly on disk, and the index of its frame."""
+
+    index: int
+    image: Spilled[RangeFrame]
 
 
 class Observations:
@@ -72,8 +81,8 @@ class Observations:
         self.refiner = config.refinement.start(self.views)
         self.model = ModelBuilder(config.fusion, surface=surface)
         self._places = Spacing(views_per_place=_VIEWS_PER_PLACE).places()
-        self._checks = frame_samples.EvenSample[Spilled[RangeFrame]](_CHECKED_IMAGES)
-        self._open_checks = frame_samples.EvenSample[Spilled[RangeFrame]](_CHECKED_IMAGES)
+        self._checks = frame_samples.EvenSample[CheckedImage](_CHECKED_IMAGES)
+        self._open_checks = frame_samples.EvenSample[CheckedImage](_CHECKED_IMAGES)
         self._checks_spill: Spill[RangeFrame] = Spill(checked_bytes(config.memory_mb))
         self.depths: dict[int, float] = {}
         self.color_depths: dict[int, float] = {}
@@ -129,9 +138,9 @@ class Observations:
             if isinstance(clean, RangeFrame):
 
                 @cache
-                def restored() -> Spilled[RangeFrame]:
+                def restored() -> CheckedImage:
                     image = cross_view_agreement.restore_thinned(frame, clean)
-                    return Spilled(image, self._checks_spill)
+                    return CheckedImage(image.index, Spilled(image, self._checks_spill))
 
                 self._checks.offer(restored)
                 if max(step.moving_fraction, step.rival) > checks.MAX_MOVING:
@@ -152,12 +161,12 @@ class Observations:
             )
 
     @property
-    def checks(self) -> Sequence[Spilled[RangeFrame]]:
+    def checks(self) -> Sequence[CheckedImage]:
         """Images that are compared with each other at the final poses."""
         return self._checks.items
 
     @property
-    def open_checks(self) -> Sequence[Spilled[RangeFrame]]:
+    def open_checks(self) -> Sequence[CheckedImage]:
         """Images of which so much moves that it is open what stands still."""
         return self._open_checks.items
 

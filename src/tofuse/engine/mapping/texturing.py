@@ -21,6 +21,7 @@ from tofuse.engine.sensor import CameraErrors
 # Maximum number of views and of textured triangles: more improve little. Images are reduced to at
 # most so many pixels together.
 _VIEWS, _FACES, _PIXELS = 60, 100_000, 60_000_000
+_AHEAD = 4  # whole images that are in memory
 # If none of so many frames that may have colour has it, the recording has none.
 _PROBED = 4
 # Unless a texture is required: minimum fraction of the surface that the images show, and of their
@@ -88,7 +89,8 @@ def make_texture(
     with job_pool(1, "tofuse-texture") as background:
         reduced = background.submit(mesh.clustered, _FACES)
         poses_of_frames = result.trajectory[frame_positions]
-        for (_, read), T in zip(selected.read_with(prepared), poses_of_frames, strict=True):
+        read_frames = selected.read_with(prepared, _AHEAD)
+        for (_, read), T in zip(read_frames, poses_of_frames, strict=True):
             progress.advance()
             if read is None:
                 continue

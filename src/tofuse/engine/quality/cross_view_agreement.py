@@ -16,11 +16,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.compute import run_all
-from tofuse.engine.frames import RangeFrame, evenly_spaced
+from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import pair_agreement
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
@@ -30,7 +29,6 @@ _POINTS = 700
 _COLUMNS = 200
 # Pairs with less overlap are left out.
 _MIN_OVERLAP = 0.2
-_MAX_VIEWS = 60
 _NEIGHBOURS = np.ones((3, 3), np.uint8)
 
 
@@ -109,16 +107,6 @@ class CrossViewConsistency:
             if np.isfinite(consecutive + distant)
             else 0.0
         )
-
-
-def cross_view_consistency(frames: Sequence[RangeFrame], poses: ArrayLike) -> CrossViewConsistency:
-    """Compare all pairs of frames under their poses (N, 4, 4) T_world_camera.
-
-    Uses at most 60 of them, evenly spaced. Frames without a pose (NaN) are left out.
-    """
-    T = np.asarray(poses, float)
-    rows = evenly_spaced(np.flatnonzero(np.isfinite(T).all((1, 2))), _MAX_VIEWS)
-    return compare_views([prepare_for_comparison(frames[k]) for k in rows], T[rows])
 
 
 def prepare_for_comparison(frame: RangeFrame) -> PreparedView:
