@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.helpers.made_rooms import CAMERA, at, seen, surface
@@ -50,6 +52,30 @@ def floor_from_above(height, k: int, noise: float = 0.001, step=STEP) -> RangeFr
     return RangeFrame(k, 0.5 * k, CAMERA, z.astype(np.float32), "z")
 
 
+def patterned(height, pattern, k: int, noise: float, step) -> RangeFrame:
+    """The same with the amplitude of a matt floor, its albedo a pattern of x and y."""
+    frame, rays = floor_from_above(height, k, 0.005, step), CAMERA.rays()
+    z = np.asarray(frame.z, float)
+    x, y = (rays * z[..., None] + k * np.array(step[:2])).transpose(2, 0, 1)
+    slope = [(height(x + d, y + e) - height(x, y)) / 1e-4 for d, e in ((1e-4, 0), (0, 1e-4))]
+    length2 = 1 + (rays**2).sum(-1)
+    facing = np.abs(rays[..., 0] * slope[0] + rays[..., 1] * slope[1] + 1)
+    cosine = facing / np.sqrt(length2 * (1 + slope[0] ** 2 + slope[1] ** 2))
+    relative = 1 + noise * np.random.default_rng(100 + k).standard_normal(z.shape)
+    amplitude = (3000 * pattern(x, y) * cosine / (z**2 * length2) * relative).astype(np.float32)
+    return replace(frame, amplitude_image=amplitude)
+
+
+def joints(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Albedo that is the same after a period: dark joints between tiles."""
+    return np.where((x % PERIOD < 0.02) | (y % PERIOD < 0.02), 0.5, 1.0)
+
+
+def stains(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Albedo that never repeats itself."""
+    return 1 + 0.3 * np.sin(9 * x + 5 * y**2) * np.cos(8 * y + 3 * x**2)
+
+
 def found(frames, poses, seconds: float) -> tuple[int, ...]:
     """The frames to which another step fits, if they were taken this long after each other."""
     views = [PosedView(surface(frame), T) for frame, T in zip(frames, poses, strict=True)]
@@ -76,6 +102,16 @@ def test_camera_that_seems_to_stand_still_may_have_moved_by_a_period(height) -> 
     assert np.linalg.norm(result.trajectory[-1][:3, 3]) < 0.01
     assert "ambiguous_steps" in [reason.code for reason in result.diagnostics.reasons]
     assert np.isinf(result.diagnostics.accuracy.position_m)
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.15])
+@pytest.mark.parametrize("height", [tiles, blocks, flat])
+@pytest.mark.parametrize("step", [STEP, (0.1, 0.05, 0.0)])
+def test_pattern_decides_whether_a_floor_repeats_itself(height, noise, step) -> None:
+    poses = [se3.translation(k * np.array(step)) for k in range(3)]
+    for pattern, expected in ((joints, (1, 2)), (stains, ())):
+        frames = [patterned(height, pattern, k, noise, step) for k in range(3)]
+        assert found(frames, poses, 0.5) == expected
 
 
 @pytest.mark.parametrize("height", [relief, flat])

@@ -17,7 +17,7 @@ from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
-from tofuse.engine.search import DISTINCT_M
+from tofuse.engine.search import DISTINCT_M, pair_agreement
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.tracking import FrameTime, reach_m
 from tofuse.engine.views import PreparedView
@@ -37,12 +37,10 @@ _FINE = projective.ProjectiveOptions(
 )
 # Number of starts that are aligned finely: those that fit best.
 _MAX_FINE = 4
-# A rival sees this fraction of the view at least, and its score per point that it sees is lower by
-# this fraction at most: the scores of right poses differ by as much.
-_MIN_OVERLAP, _EQUAL = 0.5, 0.03
-# If the camera seems to stand still, by at most so many pixels, the same pixels see the same edges,
-# and its pose scores up to 8 % higher than one further by a period.
-_STILL, _EQUAL_IF_STILL = 0.5, 0.1
+# A rival sees this fraction of the view at least. Its alignment scores this fraction lower at most
+# for each point that it sees; an alignment gives the pattern of a surface little weight, so the
+# images must also agree as well but for a tenth: by a period they do, in bare rooms half as well.
+_MIN_OVERLAP, _MAX_LOSS, _EQUAL = 0.5, 0.25, 0.1
 
 
 def ambiguous_frames(
@@ -99,20 +97,28 @@ def has_rival(
         return bool(DISTINCT_M < np.linalg.norm(shift) < reach)
 
     (own,) = aligned([T_earlier_later], _FINE)
-    pixel = float(np.nanmedian(np.abs(np.diff(later.rays[..., 0], axis=1))))
-    moved = se3.change_of_view(T_earlier_later, later.depth)
-    equal = _EQUAL_IF_STILL if moved < _STILL * pixel else _EQUAL
     offsets = reach * np.outer(_DISTANCES, _DIRECTIONS).ravel()
     starts = [T_earlier_later @ se3.translation((d.real, d.imag, 0.0)) for d in offsets]
     best = sorted(filter(is_rival, aligned(starts, _COARSE)), key=_score, reverse=True)[:_MAX_FINE]
-    return any(
-        is_rival(rival)
-        and not len(rival.unobservable)
-        and _score(rival) > (1 - equal) * _score(own)
+    rivals = [
+        rival.T_world_source
         for rival in aligned([b.T_world_source for b in best], _FINE)
-    )
+        if is_rival(rival)
+        and not len(rival.unobservable)
+        and _score(rival) > (1 - _MAX_LOSS) * _score(own)
+    ]
+    if not rivals or own.overlap < _MIN_OVERLAP:
+        return False
+    images = pair_agreement.Comparison.of(later, earlier)
+    agreement = _agreement(images.at(own.T_world_source))
+    return any(_agreement(images.at(T)) > (1 - _EQUAL) * agreement for T in rivals)
 
 
 def _score(found: projective.Aligned) -> float:
     """Return the score for each point that both views see."""
     return found.score / found.overlap if found.overlap >= _MIN_OVERLAP else -np.inf
+
+
+def _agreement(found: pair_agreement.Agreement) -> float:
+    """Return how well two images agree where both see a surface."""
+    return found.score / max(found.overlap, 1e-9)
