@@ -61,7 +61,7 @@ _MIN_SUPPORT = 1 / 3
 # rival.
 _MIN_TURNED_OVERLAP = 0.5
 # Probability above which a pose is not searched again without free space.
-_LIKELY = 0.5
+_LIKELY = 0.7
 # Points that describe a cloud to find its symmetries, and number of its motions that are aligned.
 _SYMMETRY_POINTS, _MAX_SYMMETRIES = 1500, 6
 # Cache: a view is registered to several others.
