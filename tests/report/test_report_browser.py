@@ -133,8 +133,9 @@ def test_page_bounds_lengths_as_python_does(browser):
         rng.normal(0, 3, (count, 3)).astype(np.float32),
         rng.integers(0, 2, (count, cameras), np.uint8) * np.uint8(80) + np.uint8(1),
         np.concatenate([rng.normal(size=(cameras, 3)), axes], 1).astype(np.float32),
+        rng.normal(0, 3, (count, 3)).astype(np.float32),
         (L @ L.T).astype(np.float32),
-        {"focal": 0.01, "offset": 0.004, "scale": 0.02, "surface": 0.003},
+        {"focal": 0.01, "offset": 0.004, "scale": 0.02, "range": 0.01, "surface": 0.003},
     )
     ends = rng.normal(0, 3, (20, 2, 3))
     page = browser.new_page()

@@ -1,9 +1,9 @@
 """How well the distance of two points of a model is known.
 
 Errors of the poses move a point with the keyframes that saw it, and points that the same ones saw
-move together: only the joint covariance of the keyframes says how far apart two points are. Errors
-of the camera deform what each keyframe saw, that of the depth scale stretches everything, and views
-disagree about a surface by what their noise and multipath leave.
+move together: only the joint covariance of the keyframes says how far apart two points are. A wrong
+focal length stretches what each keyframe saw, a wrong depth scale everything, multipath moves each
+point along its line of sight, and of the disagreement of views a part remains in their mean.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import KdTree
+from tofuse.engine.normal import OF_95_PERCENT
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.results import Reconstruction
 
-# Standard deviation of the depth scale, which no view of the recording shows, and multipath changes
-# as well: data sheets of depth cameras state 1 %.
-_SCALE = 0.01
-# Errors of the camera are known as well as covariances that nothing confirms.
-_MODEL_DOF = pose_accuracy.Accuracy.degrees
+# Standard deviations of what no comparison of views shows, as fractions of the range: of the depth
+# scale, as data sheets of depth cameras state, and of what multipath and smoothing add from place
+# to place, as in simulated recordings.
+_SCALE, _RANGE = 0.01, 0.005
 # Small motions of a keyframe whose pose is not bounded: m, and rad.
 _UNBOUNDED = np.array([30.0] * 3 + [10.0] * 3)
 # Reasons for which the poses have no bound, although their covariance is small.
@@ -48,7 +48,8 @@ class Length:
         Half of its 95 % interval; inf if no measurement bounds it.
     causes_m
         The parts of `bound_m`, whose squares add up: errors of the `poses`, of the `focal` length,
-        of the range (`offset`), of the depth `scale`, and of the `surface`.
+        of all ranges (`offset`), of the depth `scale`, of the `range` at each end, and of the
+        `surface`.
     """
 
     length_m: float
@@ -80,17 +81,20 @@ class LengthErrors:
         (P, K) weights of the keyframes that saw each, up to a factor.
     cameras
         (K, 6) position and viewing direction of each keyframe.
+    sights
+        (P, 3) mean line of sight to each point, over the cosine of its angle to the normal.
     covariance
         (6K, 6K) of small motions of the keyframes, translation and rotation about the centre, times
         the square of the quantile of a 95 % interval.
     bounds
-        95 % bounds of the errors of the camera, and of the surface at both ends together.
+        95 % bounds of the errors of the camera, and of the distance of the surfaces of two views.
     """
 
     centre: Float64
     points: Float32
     weights: UInt8
     cameras: Float32
+    sights: Float32
     covariance: Float32
     bounds: Mapping[str, float]
 
@@ -107,20 +111,25 @@ class LengthErrors:
         if known is None:
             return None
         seen = known.seen.pixels.any(0)
-        weights = known.seen.pixels.T[seen]
-        if not len(weights):
+        points, pixels = known.surfaces.points[seen], known.seen.pixels.T[seen]
+        if not len(points):
             return None
-        weights = np.ceil(254 * weights / weights.max(1, keepdims=True)).astype(np.uint8)
+        weights = np.ceil(254 * pixels / pixels.max(1, keepdims=True)).astype(np.uint8)
         cameras = known.poses[:, :3, [3, 2]].swapaxes(1, 2).reshape(-1, 6)
-        sigmas = {**accuracy.camera_sigmas, "scale": _SCALE, "surface": accuracy.surface_m or 0.0}
-        quantile, of_model = stdtrit([accuracy.degrees, _MODEL_DOF], 0.975).tolist()
+        # Pixels are the cosine over the squared depth, information is that over its fourth power.
+        cosines = (pixels**2).sum(1) / known.seen.information.T[seen].sum(1)
+        sights = points - pixels @ cameras[:, :3] / pixels.sum(1, keepdims=True)
+        sigmas = {"scale": _SCALE, "range": _RANGE, "surface": accuracy.surface_m or 0.0}
+        sigmas |= accuracy.camera_sigmas
+        quantile = float(stdtrit(accuracy.degrees, 0.975))
         return cls(
             known.centre,
-            known.surfaces.points[seen],
+            points,
             weights,
             cameras.astype(np.float32),
+            (sights / cosines[:, None]).astype(np.float32),
             (quantile**2 * _covariance(known, result)).astype(np.float32),
-            {name: of_model * sigma for name, sigma in sigmas.items()},
+            {name: OF_95_PERCENT * sigma for name, sigma in sigmas.items()},
         )
 
     @cached_property
@@ -145,19 +154,20 @@ class LengthErrors:
         length = float(np.linalg.norm(ends[0] - ends[1]))
         e = (ends[0] - ends[1]) / length
         nearest, _ = self._tree.nearest(ends)
-        by_motion, by_focal, by_offset = np.zeros((len(self.cameras), 6)), 0.0, 0.0
-        for p, row, sign in zip(ends, nearest, (1.0, -1.0), strict=True):
-            w = sign * self.weights[row] / self.weights[row].sum(dtype=float)
-            by_motion += np.outer(w, np.concatenate([e, np.cross(p, e)]))
-            arm, axis = p - self.cameras[:, :3], self.cameras[:, 3:]
-            across = arm - (arm * axis).sum(1, keepdims=True) * axis
-            by_focal += float(w @ across @ e)
-            by_offset += float(w @ (arm / np.linalg.norm(arm, axis=1, keepdims=True)) @ e)
-        h = by_motion.ravel()
-        causes = {"poses": float(np.sqrt(max(float(h @ self.covariance @ h), 0.0)))}
-        effects = {"focal": by_focal, "offset": by_offset, "scale": length, "surface": 1.0}
-        for name, effect in effects.items():
-            causes[name] = self.bounds.get(name, 0.0) * abs(effect)
+        w = self.weights[nearest] / self.weights[nearest].sum(1, keepdims=True, dtype=float)
+        signed = w * [[1], [-1]]
+        h = signed.T @ np.concatenate([np.tile(e, (2, 1)), np.cross(ends, e)], 1)
+        arm, axis = ends[:, None] - self.cameras[:, :3], self.cameras[:, 3:]
+        effects = {
+            # Across its axis; the poses follow, so that also views of one end each fit together.
+            "focal": length * (1 - w.mean(0) @ (axis @ e) ** 2),
+            "offset": (signed * (arm @ e) / np.linalg.norm(arm, axis=2)).sum(),
+            "scale": length,
+            "range": np.linalg.norm(self.sights[nearest] @ e),
+            "surface": np.linalg.norm(w) / np.sqrt(2),
+        }
+        causes = {"poses": float(np.sqrt(max(h.ravel() @ self.covariance @ h.ravel(), 0.0)))}
+        causes |= {n: self.bounds.get(n, 0.0) * abs(float(size)) for n, size in effects.items()}
         bound = float(np.linalg.norm([*causes.values()]))
         return Length(length, bound if bound < max(length, 1.0) else np.inf, causes)
 

@@ -125,6 +125,7 @@ def packed_lengths(errors: LengthErrors) -> Values:
         "points": pack(errors.points),
         "weights": pack(errors.weights),
         "cameras": pack(errors.cameras),
+        "sights": pack(errors.sights),
         "covariance": pack(errors.covariance[np.tril_indices(len(errors.covariance))]),
         "bounds": dict(errors.bounds),
     }

@@ -75,11 +75,11 @@ function makeMeasure(box, view, painter, { sigmaOf, axes, lengths, changed }) {
   return { toggle, add, miss: () => say("No surface there: tap the model"), place, line, get on() { return on; } };
 }
 
-const CAUSES = { poses: "poses", focal: "focal length", offset: "range offset", scale: "depth scale", surface: "the surfaces" };
+const CAUSES = { poses: "poses", focal: "focal length", offset: "range offset", scale: "depth scale", range: "local range errors", surface: "the surfaces" };
 
 // The 95 % bounds of the distance of two points in the world by cause: `LengthErrors.between` in Python.
-async function makeLengths({ centre, points, weights, cameras, covariance, bounds }) {
-  const [P, camera, C] = await Promise.all([points, cameras, covariance].map((text, k) => unpack(text, Float32Array, [3, 6, 1][k])));
+async function makeLengths({ centre, points, weights, cameras, sights, covariance, bounds }) {
+  const [P, camera, sight, C] = await Promise.all([points, cameras, sights, covariance].map((text, k) => unpack(text, Float32Array, [3, 6, 3, 1][k])));
   const K = camera.length / 6, seen = await unpack(weights, Uint8Array, K);
   const nearest = (p) => {
     let best = 0, least = Infinity;
@@ -92,25 +92,27 @@ async function makeLengths({ centre, points, weights, cameras, covariance, bound
   return (a, b) => {
     const d = minus(a, b), length = Math.hypot(...d), e = d.map((value) => value / length);
     const h = new Float64Array(6 * K);
-    let focal = 0, offset = 0;
+    let focal = 0, offset = 0, range = 0, surface = 0;
     for (const [end, sign] of [[a, 1], [b, -1]]) {
-      const p = minus(end, centre), row = K * nearest(p), used = seen.subarray(row, row + K);
+      const p = minus(end, centre), row = nearest(p), used = seen.subarray(K * row, K * row + K);
       const total = used.reduce((sum, value) => sum + value, 0);
       const motion = [...e, p[1] * e[2] - p[2] * e[1], p[2] * e[0] - p[0] * e[2], p[0] * e[1] - p[1] * e[0]];
       used.forEach((value, k) => {
         if (!value) return;
         const w = sign * value / total, arm = minus(p, camera.subarray(6 * k, 6 * k + 3)), axis = camera.subarray(6 * k + 3, 6 * k + 6);
         motion.forEach((m, i) => { h[6 * k + i] += w * m; });
-        focal += w * (dot(arm, e) - dot(arm, axis) * dot(axis, e));
+        focal += length / 2 * Math.abs(w) * (1 - dot(axis, e) ** 2);
         offset += w * dot(arm, e) / Math.hypot(...arm);
+        surface = Math.hypot(surface, w / Math.SQRT2);
       });
+      range = Math.hypot(range, dot(sight.subarray(3 * row, 3 * row + 3), e));
     }
     // The lower triangle of the covariance, row by row.
     let poses = 0;
     for (let i = 0, at = 0; i < 6 * K; i++) {
       for (let j = 0; j <= i; j++, at++) poses += (i === j ? 1 : 2) * h[i] * C[at] * h[j];
     }
-    const effects = { focal, offset, scale: length, surface: 1 };
+    const effects = { focal, offset, scale: length, range, surface };
     const others = Object.entries(effects).map(([name, effect]) => [name, (bounds[name] || 0) * Math.abs(effect)]);
     return { poses: Math.sqrt(Math.max(poses, 0)), ...Object.fromEntries(others) };
   };
