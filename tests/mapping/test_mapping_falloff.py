@@ -12,6 +12,7 @@ from tofuse.engine.cameras.cameras import ray_lengths
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
+from tofuse.engine.mapping import falloff
 from tofuse.engine.mapping.adaptation import adapted
 from tofuse.engine.mapping.falloff import estimate_falloff
 from tofuse.engine.mapping.methods import from_method
@@ -160,3 +161,11 @@ def test_colour_falloff_is_compensated(forward):
     slopes = [v.albedo[..., 1:] - expected.albedo[..., 1:] for v in (view, plain)]
     right, wrong = (np.abs(np.nanmedian(s, axis=(0, 1))).max() for s in slopes)
     assert right < wrong / 4
+
+
+def test_no_light_falls_off_by_what_little_evidence_says(frames, monkeypatch):
+    """Pairs that hardly tell may agree by chance, on a falloff that there is not."""
+    few = iter(falloff._Slope(exponent, 0.1, 0.02) for exponent in (16.6, 16.0, 16.3, 16.2) * 3)
+    monkeypatch.setattr(falloff, "_slope_from", lambda *_: next(few))
+    given = recording(frames, 0.0)
+    assert estimate_falloff(given, lambda f: f, SurfaceOptions(), falloff.RANGE) == 0.0

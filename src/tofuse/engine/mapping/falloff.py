@@ -69,11 +69,14 @@ class Law:
     travel
         Mean motion of points (N, 3) from one view to another, in the units in which the law is
         observable.
+    limit
+        No light falls off by a larger exponent: then the pairs show something else.
     """
 
     logarithm: Callable[[Float64], Float64]
     compensated: Callable[[PreparedView, float], PreparedView]
     travel: Callable[[Float64, Float64], float]
+    limit: float
 
 
 def _image_motion(p: Float64, q: Float64) -> float:
@@ -89,18 +92,20 @@ OFF_AXIS = Law(
     lambda p: -0.5 * np.log1p((p[:, :2] ** 2).sum(1) / p[:, 2] ** 2),
     PreparedView.with_falloff,
     _image_motion,
+    20.0,
 )
 RANGE = Law(
     _log_range,
     PreparedView.with_range_falloff,
     lambda p, q: float(np.abs(_log_range(p) - _log_range(q)).mean()),
+    8.0,
 )
 
 
 def estimate_falloff(
     recording: Recording, prepare: Prepare, options: SurfaceOptions, law: Law = OFF_AXIS
 ) -> float:
-    """Return the exponent of the remaining falloff in the views; 0 if not significant.
+    """Return the exponent of the remaining falloff in the views; 0 if there is no evidence.
 
     Parameters
     ----------
@@ -138,7 +143,7 @@ def estimate_falloff(
     exponent, error = pooled(exponents, information)
     # Student's t, as the spread is estimated from few pairs.
     threshold = float(stdtrit(len(slopes) - 1, 1 - _SIGNIFICANCE)) * error
-    return exponent if abs(exponent) > threshold else 0.0
+    return exponent if threshold < abs(exponent) < law.limit else 0.0
 
 
 @dataclass(frozen=True)
