@@ -152,7 +152,7 @@ def test_advice_closes_the_loop() -> None:
     axis = advice.T_world_camera[:3, 2]
     assert np.degrees(np.arctan2(axis[0], axis[2])) == pytest.approx(-10, abs=45)
     assert "right" in advice.words
-    assert advice.words.endswith(f"10 to {1e3 * advice.expected_m:.1f} mm")
+    assert advice.words.endswith(f"10 mm to {1e3 * advice.expected_m:.1f} mm")
 
 
 @pytest.mark.parametrize(

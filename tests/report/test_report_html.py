@@ -243,7 +243,7 @@ def test_filter_used_twice_removes_a_fraction_of_what_reached_it_first(tmp_path)
     halves = [replace(first, depth=first.depth.copy()) for _ in range(2)]
     for frame, columns in zip(halves, (4, 8), strict=True):
         frame.depth[:, :columns] = 0
-    share = f"{100 * 8 / first.depth.shape[1]:.1f} %"
+    share = f"{100 * 8 / first.depth.shape[1]:.0f} %"
     steps = (("raw", first), ("confidence", halves[0]), ("confidence", halves[1]))
     assert share in page(tmp_path, lonely(), ReportExtras("x", steps)).sections["filters"]
 

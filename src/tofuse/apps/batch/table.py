@@ -10,6 +10,7 @@ from urllib.parse import quote
 
 from tofuse.apps.batch.folder import BatchFolder, Record
 from tofuse.apps.batch.jobs import Job
+from tofuse.engine.quantities import length
 from tofuse.formats.files import atomic, locked
 
 COLUMNS = (
@@ -83,12 +84,10 @@ def _html(
 
 def _row(job: Job, record: Record, folder: BatchFolder) -> dict[str, str | int]:
     """Return the texts of a job that has ended; `tone` is its colour: good, degraded or failed."""
-    from tofuse.engine.results import accuracy_card
-
     done = record.state == "done"
     accuracy = ""
     if record.position_m is not None:
-        accuracy = f"±{accuracy_card.length(record.position_m)}"
+        accuracy = f"±{length(record.position_m)}"
         accuracy += "" if record.relative is None else f" ({100 * record.relative:.2g} %)"
     elif done:
         accuracy = "not bounded"

@@ -12,6 +12,7 @@ from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import Mapper
 from tofuse.engine.progress import OnlineMap
+from tofuse.engine.quantities import length
 from tofuse.engine.results import Reconstruction
 
 # Turns of the camera at its place, in degrees to the right and upwards, each from the one before.
@@ -105,14 +106,14 @@ def best(known: Known, within_s: float = np.inf) -> Advice:
     chosen = min(good.tolist(), key=lambda k: moves[k].effort)
     move, factor, bound_m = moves[chosen], float(factors[chosen]), known.bound_m
     expected_m = factor * bound_m
-    before, after = _millimetres(bound_m), _millimetres(expected_m)
-    gain = f"{before} to {after} mm"
+    before, after = length(bound_m), length(expected_m)
+    gain = f"{before} to {after}"
     if not np.isfinite(bound_m):
         gain = f"{100 * (1 - factor):.0f} % less uncertain"
         if len(known.gaps):
             gain += f", but nothing bounds the motion {known.ages_s[known.gaps[-1]]:.0f} s ago"
     elif before == after:
-        return Advice(bound_m, bound_m, f"go on: no look back would lower the {before} mm")
+        return Advice(bound_m, bound_m, f"go on: no look back would lower the {before}")
     pose = poses[move.way[-1]].copy()
     pose[:3, 3] += known.centre
     gaps = tuple((int(known.frames[k]), int(known.frames[k + 1])) for k in known.gaps)
@@ -221,8 +222,3 @@ def _way(step: Float64) -> str:
 
 def _tens(degrees: float) -> int:
     return int(10 * round(abs(degrees) / 10))
-
-
-def _millimetres(metres: float) -> str:
-    """Return millimetres: tenths below ten."""
-    return f"{1e3 * metres:.1f}" if metres < 0.00995 else f"{1e3 * metres:.0f}"

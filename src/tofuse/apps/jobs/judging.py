@@ -49,6 +49,7 @@ from tofuse.engine.quality import (
     pose_deviation,
     trajectory_errors,
 )
+from tofuse.engine.quantities import length
 from tofuse.engine.refinement import Joint, propagate_poses
 from tofuse.engine.results import Reason, Reconstruction, Verdict, accuracy_card, checks, verdicts
 from tofuse.engine.stored_views import PosedView, Spacing
@@ -59,7 +60,6 @@ from tofuse.formats.recordings import Opening, OpeningOptions, open_recording, r
 
 Views = Sequence[PosedView[PreparedView]]
 
-_length = accuracy_card.length
 
 # Motion between the views of the sample, that between keyframes, and the fewest of them.
 _SPACING = Spacing(angle=0.2, distance=0.1)
@@ -567,7 +567,7 @@ def _agreement(judgement: Judgement) -> str:
     if deviation is None:
         return ""
     if not deviation.consistent:
-        about, at_least = map(_length, (deviation.estimate_m, deviation.at_least_m))
+        about, at_least = map(length, (deviation.estimate_m, deviation.at_least_m))
         beyond = any(r.code == "inconsistent_poses" for r in judgement.reasons)
         limit = "" if beyond else ", but not significantly beyond the tolerance"
         return (
@@ -576,7 +576,7 @@ def _agreement(judgement: Judgement) -> str:
         )
     if not np.isfinite(deviation.at_most_m):
         return " Consistent with the depth, as far as that constrains them."
-    return f" Consistent with the depth to within {_length(deviation.at_most_m)} (95 %)."
+    return f" Consistent with the depth to within {length(deviation.at_most_m)} (95 %)."
 
 
 def _read(path: Path) -> TimedPoses:
@@ -774,8 +774,8 @@ def _contradiction(
         return
     text = (
         f"Registrations contradict the poses: surfaces are displaced by about "
-        f"{_length(deviation.estimate_m)} rms, at least {_length(deviation.at_least_m)} (95 %); "
-        f"the tolerance is {_length(allowed_m)}."
+        f"{length(deviation.estimate_m)} rms, at least {length(deviation.at_least_m)} (95 %); "
+        f"the tolerance is {length(allowed_m)}."
     )
     steps = tuple((int(a), int(b)) for a, b in deviation.ids[deviation.steps])
     if steps:

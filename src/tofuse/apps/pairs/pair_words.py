@@ -9,6 +9,7 @@ from tofuse.apps.pairs.result import PairResult
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
+from tofuse.engine.quantities import percent
 
 _MIN_AXIS_COSINE = 0.985  # minimum cosine to an axis for a direction to be named after it
 _SMALL_RAD = 1e-6
@@ -146,12 +147,6 @@ def runner_up(result: PairResult) -> str:
             f"fits {percent(abs(margin))} {'more' if margin < 0 else 'fewer'} of the points"
         )
     return ", ".join(parts)
-
-
-def percent(value: float) -> str:
-    """Return a fraction in percent as text, with a decimal if it is small."""
-    percentage = 100 * value
-    return f"{percentage:.1f} %" if 0.05 <= abs(percentage) < 9.95 else f"{percentage:.0f} %"
 
 
 def _probability(value: float) -> str:

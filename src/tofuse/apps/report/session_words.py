@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from tofuse.engine.quantities import percent
 from tofuse.engine.results import Reconstruction, SessionPair
 
 # Higher probabilities can't be justified by any model.
@@ -46,19 +47,14 @@ def change_counts(result: Reconstruction, pair: SessionPair) -> str:
 
 def overlap_evidence(pair: SessionPair) -> list[str]:
     """Return the evidence for an overlap: "86 % of the views", "8 registrations", ..."""
-    evidence = [f"{_percent(pair.overlap)} of the views"]
+    evidence = [f"{percent(pair.overlap)} of the views"]
     if pair.links:
         evidence.append(f"{pair.links} registration{'s' * (pair.links > 1)}")
     if pair.probability is not None:
         evidence.append(f"right with a probability of {probability_text(pair.probability)}")
     if pair.support is not None:
-        evidence.append(f"{_percent(pair.support)} of the overlapping measurements agree")
+        evidence.append(f"{percent(pair.support)} of the overlapping measurements agree")
     return evidence
-
-
-def _percent(fraction: float) -> str:
-    """Rounded down, so that 100 % means all."""
-    return f"{int(100 * fraction)} %"
 
 
 def probability_text(value: float) -> str:

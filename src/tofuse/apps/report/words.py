@@ -11,19 +11,11 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.frames import frame_ranges
+from tofuse.engine.quantities import length as length
+from tofuse.engine.quantities import percent as percent
 from tofuse.engine.results import Reason, verdicts
 
 STATUSES = ("tracked", "predicted", "lost", "skipped")
-
-
-def length(metres: float | None) -> str:
-    """Return a length as text: mm below 10 cm, else m."""
-    if metres is None or not np.isfinite(metres):
-        return "–"
-    if abs(metres) < 0.1:
-        mm = metres * 1000
-        return f"{mm:.0f} mm" if abs(mm) >= 10 else f"{mm:.1f} mm"
-    return f"{metres:.2f} m"
 
 
 def rounded_length(metres: float, spread: float) -> str:
@@ -41,13 +33,6 @@ def signed_length(metres: float) -> str:
 def coordinates(values: Iterable[float], digits: int) -> str:
     """Return the coordinates of a point as text."""
     return ", ".join(f"{value:.{digits}f}" for value in values).replace("-", "−")
-
-
-def percent(value: float | None) -> str:
-    """Return a fraction as text, in percent."""
-    if value is None or not np.isfinite(value):
-        return "–"
-    return f"{100 * value:.1f} %"
 
 
 def seconds(value: float) -> str:

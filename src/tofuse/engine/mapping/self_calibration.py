@@ -18,13 +18,13 @@ import numpy as np
 
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.progress import Progress
+from tofuse.engine.quantities import length
 from tofuse.engine.refinement import calibration_check
 from tofuse.engine.results import (
     Diagnostics,
     Reason,
     Reconstruction,
     SelfCalibration,
-    accuracy_card,
     verdicts,
 )
 from tofuse.engine.sensor import ERROR_OPTIONS, CameraErrors
@@ -140,7 +140,7 @@ def _bound_change(before: float, after: float) -> str:
     """Describe the change of the bound."""
     if not np.isfinite([before, after]).all():
         return ""
-    new, old = accuracy_card.length(after), accuracy_card.length(before)
+    new, old = length(after), length(before)
     return f" The bound of the pose error is {new} (95 %) instead of {old}."
 
 

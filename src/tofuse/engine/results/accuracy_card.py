@@ -8,6 +8,7 @@ import numpy as np
 
 from tofuse.engine.frames import frame_ranges
 from tofuse.engine.quality import pose_accuracy
+from tofuse.engine.quantities import length
 from tofuse.engine.results.types import Reason, Reconstruction
 from tofuse.engine.results.verdicts import ADVICE, ranked
 
@@ -72,10 +73,3 @@ def weakest_frame(accuracy: pose_accuracy.Accuracy) -> str:
     if accuracy.worst is None:
         return ""
     return f"frame {accuracy.worst.frame}, {length(accuracy.worst.position_m)}"
-
-
-def length(metres: float) -> str:
-    """Return a length as text: "2.3 mm", "24 mm", "1.20 m"."""
-    if metres >= 1:
-        return f"{metres:.2f} m"
-    return f"{metres * 1e3:.0f} mm" if metres >= 0.01 else f"{metres * 1e3:.1f} mm"

@@ -14,8 +14,8 @@ from tofuse.engine.frames import frame_ranges
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import LoopRecord, Optimisation, external_sensors, graph_covariances
 from tofuse.engine.quality import cross_view_agreement, pose_accuracy
+from tofuse.engine.quantities import length, percent
 from tofuse.engine.refinement import Refinement, calibration_check
-from tofuse.engine.results.accuracy_card import length
 from tofuse.engine.results.types import Component, FrameRecord, Reason, Verdict, in_main_model
 from tofuse.engine.results.verdicts import ranked, verdict_of
 from tofuse.engine.tracking import FrameTime, find_jumps
@@ -366,7 +366,7 @@ def _registrations(e: Evidence) -> Iterator[Reason]:
     weak = e.runs_of({index for index, r in pairs if r.inlier_ratio < WEAK_INLIER_FRACTION})
     if weak:
         text = (
-            f"Fewer than {_percent(WEAK_INLIER_FRACTION)} of the points of "
+            f"Fewer than {percent(WEAK_INLIER_FRACTION)} of the points of "
             f"{frame_ranges.in_words(weak)} have a correspondence."
         )
         yield Reason("weak_registration", weak, text)
@@ -444,7 +444,7 @@ def _scene(e: Evidence) -> Iterator[Reason]:
             largest = max(
                 x for frame, x in fractions.items() if any(a <= frame <= b for a, b in where)
             )
-            text = words.format(_percent(largest), frame_ranges.in_words(where))
+            text = words.format(percent(largest), frame_ranges.in_words(where))
             yield Reason(code, where, f"{text} excluded from tracking and from the model.")
     parts = [*e.moving, *e.rivals]
     if frames := open_motion(parts, e.measured | e.confirmed):
@@ -453,7 +453,7 @@ def _scene(e: Evidence) -> Iterator[Reason]:
         text = (
             f"Two parts of the view move differently in {frame_ranges.in_words(where)}, and either "
             f"may be the room: the one that the camera was not tracked by has up to "
-            f"{_percent(largest)}. So no bound on the pose errors is stated."
+            f"{percent(largest)}. So no bound on the pose errors is stated."
         )
         yield Reason("open_motion", where, text)
     doubtful = e.runs_of(e.doubtful)
@@ -666,8 +666,7 @@ def cross_view_reasons(
     if not np.isfinite(cross_view.support()):
         return
     summary = (
-        f"{_percent(cross_view.support())} of overlapping measurements are consistent with the "
-        "poses"
+        f"{percent(cross_view.support())} of overlapping measurements are consistent with the poses"
     )
     if np.isfinite(cross_view.rms_m()):
         summary += f" ({cross_view.rms_m() * 1e3:.1f} mm rms)"
@@ -686,7 +685,7 @@ def cross_view_reasons(
     consecutive_support = cross_view.support(consecutive)
     if cross_view.support() < AGREEMENT_RATIO * consecutive_support:
         consecutive_text = (
-            f"{_percent(consecutive_support)} ({cross_view.rms_m(consecutive) * 1e3:.1f} mm rms)"
+            f"{percent(consecutive_support)} ({cross_view.rms_m(consecutive) * 1e3:.1f} mm rms)"
         )
         texts.append(f"{summary}, but {consecutive_text} in consecutive images.")
     if texts:
@@ -713,10 +712,6 @@ def _poses_of(ranges: Sequence[frame_ranges.Range]) -> str:
     single = frame_ranges.is_single(ranges)
     subject, verb = ("The pose", "is") if single else ("Poses", "are")
     return f"{subject} of {frame_ranges.in_words(ranges)} {verb}"
-
-
-def _percent(fraction: float) -> str:
-    return f"{100 * fraction:.0f} %"
 
 
 def _angle(rad: float) -> str:
