@@ -7,8 +7,8 @@ import pytest
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry.se3 import exp
+from tofuse.engine.times import MAX_GAP_S, associate, nearest
 from tofuse.formats.poses.trajectory import (
-    associate,
     read_tum,
     tum_text,
     write_tum,
@@ -82,23 +82,22 @@ def test_bad_lines_are_reported(tmp_path: Path, line: str, words: str) -> None:
     assert "t.txt, line 3" in str(caught.value)
 
 
-def test_association_is_nearest_within_limit() -> None:
+def test_nearest_within_limit() -> None:
     others = [1.0, 0.0, 2.0]  # unsorted
-    assert associate([0.019, 0.981, 1.5, 2.02], others).tolist() == [1, 0, -1, 2]
-    assert associate([0.0211], [0.0]).tolist() == [-1]
-    assert associate([], others).tolist() == []
-    assert associate([1.0], []).tolist() == [-1]
+    assert nearest(others, [0.019, 0.981, 1.5, 2.02], 0.02).tolist() == [1, 0, -1, 2]
+    assert nearest([0.0, np.nan], [0.0211, 0.5, np.nan], 0.02).tolist() == [-1, -1, -1]
+    assert nearest(others, []).tolist() == []
+    assert nearest([], [1.0]).tolist() == [-1]
 
 
 def test_association_matches_slow_search() -> None:
     rng = np.random.default_rng(9)
-    times, others = np.arange(60) / 30, np.sort(rng.uniform(0, 2, 40))
-    found = associate(times, others)
-    for k, index in enumerate(found):
-        gaps = np.abs(others - times[k])
-        if index >= 0:
-            assert gaps[index] <= 0.02 + 1e-9
-            assert gaps[index] == gaps.min()
-        else:
-            nearest = int(gaps.argmin())
-            assert gaps.min() > 0.02 or nearest in found
+    a, b = np.arange(60) / 30, rng.uniform(0, 2, 70)
+    a[7] = b[3] = np.nan
+    gaps = np.abs(a[:, None] - b)
+    expected = []
+    while np.nanmin(gaps) < MAX_GAP_S:
+        i, j = np.unravel_index(np.nanargmin(gaps), gaps.shape)
+        expected.append((i, j))
+        gaps[i], gaps[:, j] = np.inf, np.inf
+    assert associate(a, b).tolist() == [list(pair) for pair in sorted(expected)]

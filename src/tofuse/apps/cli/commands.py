@@ -483,7 +483,7 @@ def _stop_on_signal() -> Iterator[threading.Event]:
 def evaluate(arguments: cli.Evaluate) -> int:
     """``tofuse evaluate``."""
     from tofuse.apps.jobs import evaluate as evaluate_poses
-    from tofuse.engine.quality import trajectory_errors
+    from tofuse.engine.times import MAX_GAP_S
 
     evaluation = evaluate_poses(
         arguments.estimate,
@@ -495,7 +495,7 @@ def evaluate(arguments: cli.Evaluate) -> int:
     if error.mostly_unmatched:
         print(
             f"note: only {error.associated} of {error.estimated} estimated poses have a reference "
-            f"pose within {1000 * trajectory_errors.MAX_GAP_S:.0f} ms: "
+            f"pose within {1000 * MAX_GAP_S:.0f} ms: "
             "check that both files have the same clock",
             file=sys.stderr,
         )

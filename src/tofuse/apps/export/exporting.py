@@ -27,11 +27,12 @@ from tofuse.apps.results import (
 from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.fusion import GeometryRecord, Mesh, texture
+from tofuse.engine.times import nearest
 from tofuse.formats.export import exchange
 from tofuse.formats.files import atomic, staging, stamps
 from tofuse.formats.geometry import read_textured_glb
 from tofuse.formats.images import jpeg_bytes
-from tofuse.formats.poses import associate, read_tum, write_kitti, write_log
+from tofuse.formats.poses import read_tum, write_kitti, write_log
 
 # Maximum size of a .glb with a texture.
 _MAX_BYTES = 8_000_000
@@ -165,7 +166,7 @@ def _log(result: _Result, path: Path) -> None:
     with run_json.opened(result.folder) as run:
         times, index = run_json.frame_clock(run)
     stamps_of_poses, poses = result.trajectory
-    write_log(path, poses, index[associate(stamps_of_poses, times, limit=1e-6)])
+    write_log(path, poses, index[nearest(times, stamps_of_poses, 1e-6)])
 
 
 # The file of each format, and the function that writes it.

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
+from tofuse.engine.times import MAX_GAP_S, associate
 
-MAX_GAP_S = 0.02
 RPE_FRAMES = (1, 30)
 # Weight of orientations in the alignment, as a spread of positions in m^2: (10 um)^2.
 _ORIENTATION_WEIGHT = 1e-10
@@ -167,42 +167,6 @@ def evaluate_trajectory(
         position_errors=errors,
         estimated=int(np.isfinite(estimate).all((1, 2)).sum()),
     )
-
-
-def associate(times_a: ArrayLike, times_b: ArrayLike) -> Intp:
-    """Associate times one to one, less than `MAX_GAP_S` apart, closest first.
-
-    Parameters
-    ----------
-    times_a, times_b
-        (N,) and (M,) s; NaN is never associated.
-
-    Returns
-    -------
-    (A, 2) rows in a and b, in order of a's time.
-    """
-    a, b = np.asarray(times_a, float), np.asarray(times_b, float)
-    order_b = np.argsort(b, kind="stable")
-    order_b = order_b[np.isfinite(b[order_b])]
-    sorted_b = b[order_b]
-    candidates = []
-    for i in np.flatnonzero(np.isfinite(a)).tolist():
-        first, last = np.searchsorted(sorted_b, [a[i] - MAX_GAP_S, a[i] + MAX_GAP_S], "left")
-        candidates += [
-            (abs(a[i] - sorted_b[k]), int(i), int(order_b[k]))
-            for k in range(first, min(last + 1, len(sorted_b)))
-            if abs(a[i] - sorted_b[k]) < MAX_GAP_S
-        ]
-    used_a: set[int] = set()
-    used_b: set[int] = set()
-    pairs: list[tuple[int, int]] = []
-    for _, i, j in sorted(candidates):
-        if i not in used_a and j not in used_b:
-            used_a.add(i)
-            used_b.add(j)
-            pairs.append((i, j))
-    pairs.sort(key=lambda pair: (a[pair[0]], pair[0]))
-    return np.array(pairs, np.intp).reshape(-1, 2)
 
 
 def align(estimate: ArrayLike, reference: ArrayLike, arm_m: float | None = None) -> Float64:

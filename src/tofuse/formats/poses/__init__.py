@@ -1,7 +1,7 @@
 """Files of trajectories, pose graphs, single poses and loops.
 
 `read_poses` detects the format of a trajectory; `read_tum` and the writers are for one format each.
-Poses are T_world_camera, (N, 4, 4), with NaN where unknown; `associate` pairs them by time.
+Poses are T_world_camera, (N, 4, 4), with NaN where unknown; `associated_poses` are those at times.
 """
 
 from typing import TYPE_CHECKING
@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from tofuse.formats.poses.g2o import read_g2o, write_g2o
     from tofuse.formats.poses.pose import pose_text, read_loops, read_pose
     from tofuse.formats.poses.trajectory import (
-        associate,
         associated_poses,
         read_tum,
         write_kitti,

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
+from tofuse.engine.times import associate
 from tofuse.formats.files import atomic, reading, tables
-
-ASSOCIATION_LIMIT_S = 0.02
 
 
 def read_tum(path: str | Path) -> tuple[Float64, Float64]:
@@ -171,44 +170,12 @@ def _finite_poses(poses: ArrayLike) -> Float64:
     return np.asarray(T[np.isfinite(T).all((1, 2))], np.float64)
 
 
-def associate(
-    timestamps: ArrayLike,
-    others: ArrayLike,
-    *,
-    limit: float = ASSOCIATION_LIMIT_S,
-    exclusive: bool = True,
-) -> Intp:
-    """Return for each of (N,) timestamps the index of the nearest of (M,) others, or -1.
-
-    Both are in s, in any order. Matches are within `limit` seconds (inclusive, plus a nanosecond);
-    if `exclusive`, each of the others is matched at most once, to the nearest timestamp.
-    """
-    times, others = np.asarray(timestamps, float), np.asarray(others, float)
-    index = np.full(len(times), -1, np.intp)
-    if not len(times) or not len(others):
-        return index
-    order = np.argsort(others, kind="stable")
-    ordered = others[order]
-    after = np.clip(np.searchsorted(ordered, times), 0, len(ordered) - 1)
-    before = np.maximum(after - 1, 0)
-    is_before = np.abs(ordered[before] - times) <= np.abs(ordered[after] - times)
-    best = np.where(is_before, before, after)
-    gap = np.abs(ordered[best] - times)
-    # In order of the gap, so that conflicts are won by the nearer one.
-    matched = np.zeros(len(ordered), bool)
-    for k in np.argsort(gap, kind="stable"):
-        if gap[k] <= limit + 1e-9 and not matched[best[k]]:
-            matched[best[k]] = exclusive
-            index[k] = order[best[k]]
-    return index
-
-
 def associated_poses(timestamps: ArrayLike, others: ArrayLike, poses: ArrayLike) -> Float64:
     """Return poses (N, 4, 4) at timestamps (N,), matched to (M,) others with (M, 4, 4) poses.
 
     Timestamps without a match have NaN; see `associate`.
     """
-    index = associate(timestamps, others)
-    out = np.full((len(index), 4, 4), np.nan)
-    out[index >= 0] = np.asarray(poses, float)[index[index >= 0]]
+    pairs = associate(timestamps, others)
+    out = np.full((np.size(timestamps), 4, 4), np.nan)
+    out[pairs[:, 0]] = np.asarray(poses, float)[pairs[:, 1]]
     return out

@@ -11,10 +11,11 @@ from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
+from tofuse.engine.times import nearest
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading, tables
 from tofuse.formats.images import first_size
-from tofuse.formats.poses import associate, associated_poses
+from tofuse.formats.poses import associated_poses
 from tofuse.formats.sources import Reader, ReaderOptions, Sniff, inputs, phones
 
 _LIMIT_S = 0.002  # names of files of one frame may differ by a rounded millisecond
@@ -74,8 +75,8 @@ def _times(files: list[Path]) -> Float64:
 def _of_frames(folder: Path, suffix: str, times: Float64) -> list[Path | None]:
     """The file of each frame; None where there is none."""
     files = inputs.files_at(folder, suffix)
-    nearest = associate(times, _times(files), limit=_LIMIT_S, exclusive=False)
-    return [files[k] if k >= 0 else None for k in nearest]
+    found = nearest(_times(files), times, _LIMIT_S)
+    return [files[k] if k >= 0 else None for k in found]
 
 
 def _lens(file: Path, lens: Path | None, size: tuple[int, int]) -> Pinhole:

@@ -18,10 +18,10 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
+from tofuse.engine.times import nearest
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import as_color, matroska, parse_image
-from tofuse.formats.poses import associate
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, pixels
 
 
@@ -186,7 +186,7 @@ class AzureKinectSource(FileSource):
             return [None] * len(self.depth)
         depth_times = np.array([b.time_ns - delay for b in self.depth]) / 1e9
         times = np.array([b.time_ns for b in track.blocks]) / 1e9
-        pairs = associate(depth_times, times, limit=limit, exclusive=False)
+        pairs = nearest(times, depth_times, limit)
         if (pairs < 0).any():
             self.warnings.append(
                 f"{int((pairs < 0).sum())} of {len(pairs)} frames have no {track.name} image"

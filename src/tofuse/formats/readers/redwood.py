@@ -12,10 +12,11 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
+from tofuse.engine.times import nearest
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import first_size
-from tofuse.formats.poses import associate, read_poses
+from tofuse.formats.poses import read_poses
 from tofuse.formats.sources import DepthImageSource, Reader, ReaderOptions, Sniff, inputs
 
 # Open3D's PinholeCameraIntrinsicParameters.PrimeSenseDefault.
@@ -153,8 +154,8 @@ def color_files(
     color = color_images(folder)
     color_times = timestamps(color)
     if times is not None and color_times is not None:
-        nearest = associate(times, color_times, limit=COLOR_LIMIT_S, exclusive=False)
-        matches = [color[k] if k >= 0 else None for k in nearest]
+        found = nearest(color_times, times, COLOR_LIMIT_S)
+        matches = [color[k] if k >= 0 else None for k in found]
     elif len(color) == len(files):
         return list(color)
     else:

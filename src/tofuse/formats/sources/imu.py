@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.arrays import Float64
 from tofuse.engine.normal import robust_sigma
+from tofuse.engine.times import nearest
 
 ACCELERATION = ("ax", "ay", "az")
 GRAVITY = ("gravity_x", "gravity_y", "gravity_z")
@@ -52,8 +53,8 @@ def gravity_at(times: Float64, imu: Mapping[str, Float64]) -> Float64 | None:
     out = np.full((len(times), 4), np.nan)
     if not len(sample_times):
         return out
-    frame_index = _nearest(np.asarray(times, float), sample_times)
-    assigned = np.abs(sample_times - times[frame_index]) <= _MAX_GAP_S
+    frame_index = nearest(times, sample_times, _MAX_GAP_S)
+    assigned = frame_index >= 0
     count = np.bincount(frame_index[assigned], minlength=len(times))
     mean = np.zeros((len(times), 3))
     np.add.at(mean, frame_index[assigned], samples[assigned])
@@ -71,11 +72,3 @@ def gravity_at(times: Float64, imu: Mapping[str, Float64]) -> Float64 | None:
         _FUSED_SIGMA if fused else np.sqrt(spread**2 + deviation[valid] ** 2 + _MIN_SIGMA**2)
     )
     return out
-
-
-def _nearest(times: Float64, queries: Float64) -> Intp:
-    """(S,) index of the time (N,) nearest to each of the queries (S,); the earlier one in ties."""
-    order = np.argsort(times, kind="stable")
-    ordered = times[order]
-    midpoints = 0.5 * (ordered[1:] + ordered[:-1])
-    return order[np.searchsorted(midpoints, queries, side="left")]

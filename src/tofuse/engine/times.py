@@ -1,0 +1,55 @@
+"""Timestamps of different sensors: which belong together."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tofuse.engine.arrays import Float64, Intp
+
+MAX_GAP_S = 0.02  # between a frame and its pose
+
+
+def nearest(times: ArrayLike, queries: ArrayLike, limit: float = np.inf) -> Intp:
+    """Return for each of (N,) queries the position of the nearest of (M,) times, or -1.
+
+    Both are in s, in any order; of equally near times it is the earlier one. They are at most
+    `limit` seconds (and a nanosecond) apart.
+    """
+    queries, order = np.asarray(queries, float), np.argsort(times, kind="stable")
+    if not len(order):
+        return np.full(len(queries), -1, np.intp)
+    ordered: Float64 = np.asarray(times, float)[order]
+    after = np.searchsorted(ordered, queries).clip(max=len(ordered) - 1)
+    before = np.maximum(after - 1, 0)
+    gap_before, gap_after = (np.abs(ordered[k] - queries) for k in (before, after))
+    best = order[np.where(gap_before <= gap_after, before, after)]
+    return np.where(np.minimum(gap_before, gap_after) <= limit + 1e-9, best, -1)
+
+
+def associate(times_a: ArrayLike, times_b: ArrayLike) -> Intp:
+    """Associate times one to one, less than `MAX_GAP_S` apart, closest first.
+
+    Parameters
+    ----------
+    times_a, times_b
+        (N,) and (M,) s; NaN is never associated.
+
+    Returns
+    -------
+    (A, 2) rows in a and b, in order of a's time.
+    """
+    a, b = np.asarray(times_a, float), np.asarray(times_b, float)
+    i, j = np.flatnonzero(np.isfinite(a)), np.flatnonzero(np.isfinite(b))
+    found = [np.zeros((0, 2), np.intp)]
+    # Times that are each other's nearest are those that come first, as nothing is closer to either.
+    while len(i) and len(j):
+        partner = nearest(b[j], a[i])
+        mutual = nearest(a[i], b[j])[partner] == np.arange(len(i))
+        mutual &= np.abs(a[i] - b[j[partner]]) < MAX_GAP_S
+        if not mutual.any():
+            break
+        found.append(np.stack([i[mutual], j[partner[mutual]]], 1))
+        i, j = i[~mutual], np.delete(j, partner[mutual])
+    pairs = np.concatenate(found)
+    return pairs[np.lexsort((pairs[:, 0], a[pairs[:, 0]]))]
