@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from ray_casting import rays_at, to_plane
+from tofuse.engine.alignment import uncertainty
 from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align
 from tofuse.engine.alignment.step_kernels import spurious_information
 from tofuse.engine.alignment.uncertainty import (
@@ -125,7 +126,7 @@ def _made_patches(means, weights, change=0.0):
     )
 
 
-def test_residuals_near_limit_do_not_inflate_uncertainty():
+def test_residuals_near_limit_do_not_inflate_uncertainty(monkeypatch):
     """The slope of the robust weights may vanish there, and have any sign."""
     found = _made_patches(np.zeros(48), np.full(48, 1e2))
     steep = _sigmas(covariance_of_patches(found, UncertaintyOptions()))
@@ -136,7 +137,8 @@ def test_residuals_near_limit_do_not_inflate_uncertainty():
     flat = _sigmas(covariance_of_patches(found, UncertaintyOptions()))
     assert (flat >= 0.99 * steep).all()
     assert 1.5 < (flat / steep).max() < 3.5  # not above 1 / 0.3
-    unbounded = _sigmas(covariance_of_patches(found, UncertaintyOptions(steepness=1e-9)))
+    monkeypatch.setattr(uncertainty, "_STEEPNESS", 1e-9)
+    unbounded = _sigmas(covariance_of_patches(found, UncertaintyOptions()))
     assert (unbounded / steep).max() > 10
 
 
@@ -146,10 +148,9 @@ def test_less_information_never_reduces_sigma(information):
     diagonal = np.array([100.0, 100.0, information, 100.0, 100.0, 100.0, 1.0])
     H = np.diag(np.maximum(diagonal, 0.0))
     nothing = np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros((0, 7))
-    found = Patches(H, np.zeros((7, 7)), np.diag(diagonal), np.diag(diagonal), *nothing, 0, 2.0, 2)
-    options = UncertaintyOptions(noise_pixels=1.0)
-    sigma = _sigmas(covariance_of_patches(found, options))
-    assert 0.9 * options.max_sigma < sigma[2] < 1.1 * options.max_sigma
+    found = Patches(H, np.zeros((7, 7)), np.diag(diagonal), np.diag(diagonal), *nothing, 0, 2.0, 3)
+    sigma = _sigmas(covariance_of_patches(found, UncertaintyOptions()))
+    assert 0.9 * uncertainty._MAX_SIGMA < sigma[2] < 1.1 * uncertainty._MAX_SIGMA
     np.testing.assert_allclose(sigma[[0, 1, 3, 4, 5]], 0.1, rtol=1e-3)
 
 
@@ -203,5 +204,5 @@ def test_common_tilts_do_not_constrain_wall():
     assert len(align(source, targets, np.eye(4), fooled).unobservable) < 3
     aligned = align(source, targets, np.eye(4), GEOMETRY_ONLY)
     assert len(aligned.unobservable) == 3
-    found = patches(source, targets, aligned, GEOMETRY_ONLY, UncertaintyOptions())
+    found = patches(source, targets, aligned, GEOMETRY_ONLY)
     assert found.change < 0.01

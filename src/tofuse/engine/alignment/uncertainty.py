@@ -49,20 +49,24 @@ _MIN_SIGMA = 1e-3
 _MIN_INFORMATION = 1e-3
 # Approximate number of pixels used: the noise of denser ones is correlated.
 _SAMPLED_PIXELS = 6336
+# Numbers of columns and of rows of patches.
+_TILES = (8, 6)
+# Number of pixels with fully correlated noise after smoothing, of distances and of albedo.
+_NOISE_PIXELS, _PHOTO_NOISE_PIXELS = 5.0, 4.0
+# Correlation length (1/e) of the errors of patches, as a fraction of the image's width.
+_REACH = 0.31
+# Largest sigma from the data alone, in units of 1 cm and 1 degree.
+_MAX_SIGMA = 1.8
+# Lower limit of X, as a fraction of the weighted information.
+_STEEPNESS = 0.3
 
 
 @dataclass(frozen=True)
 class UncertaintyOptions:
-    """Constants of the covariance; docs/uncertainty.md describes their calibration.
+    """Systematic errors of views; docs/uncertainty.md describes their calibration.
 
     Attributes
     ----------
-    tiles
-        Numbers of columns and of rows of patches.
-    noise_pixels, photo_noise_pixels
-        Number of pixels with fully correlated noise after smoothing, of distances and of albedo.
-    reach
-        Correlation length (1/e) of the errors of patches, as a fraction of the image's width.
     hidden
         Correlated error of patches that is invisible in the residuals: fraction of the depth per
         radian of change of the view.
@@ -70,21 +74,11 @@ class UncertaintyOptions:
         Component of it common to all patches, relative to the rest.
     floor
         Minimum error of the pose, as a fraction of the change of the view.
-    max_sigma
-        Largest sigma from the data alone, in units of 1 cm and 1 degree.
-    steepness
-        Lower limit of X, as a fraction of the weighted information.
     """
 
-    tiles: tuple[int, int] = (8, 6)
-    noise_pixels: float = 5.0
-    photo_noise_pixels: float = 4.0
-    reach: float = 0.31
     hidden: float = 0.0025
     offset: float = 3.0
     floor: float = 0.008
-    max_sigma: float = 1.8
-    steepness: float = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +126,6 @@ def patches(
     targets: Sequence[Target],
     aligned: Aligned,
     alignment: ProjectiveOptions,
-    options: UncertaintyOptions,
 ) -> Patches:
     """Return the sums over the patches of an aligned view.
 
@@ -143,7 +136,7 @@ def patches(
     """
     rows, columns = source.z.shape
     stride = max(1, round(float(np.sqrt(rows * columns / _SAMPLED_PIXELS))))
-    tile_columns, tile_rows = options.tiles
+    tile_columns, tile_rows = _TILES
     photometric = (
         alignment.photometric and source.has_albedo and all(t.view.has_albedo for t in targets)
     )
@@ -202,18 +195,18 @@ def _positions(rows: int, columns: int, tile_columns: int, tile_rows: int) -> Fl
 
 def covariance_of_patches(sums: Patches, options: UncertaintyOptions) -> Float64:
     """Return the covariance (6, 6) of the right perturbation in m and rad, without a prior."""
-    hessian, prior = _with_weak_prior(_hessian(sums, options), options.max_sigma)
+    hessian, prior = _with_weak_prior(_hessian(sums))
     bread = np.asarray(np.linalg.inv(hessian), np.float64)
     per_pixel = sums.stride**2
-    B = max(1.0, options.noise_pixels / per_pixel) * sums.geometry + prior
-    B += max(1.0, options.photo_noise_pixels / per_pixel) * sums.photo
+    B = max(1.0, _NOISE_PIXELS / per_pixel) * sums.geometry + prior
+    B += max(1.0, _PHOTO_NOISE_PIXELS / per_pixel) * sums.photo
     if len(sums.weights) >= _MIN_TILES:
         x, y = sums.positions.T
         distance = np.hypot(x[:, None] - x, y[:, None] - y)
-        correlation = np.exp(-distance / options.reach)
+        correlation = np.exp(-distance / _REACH)
         observed = _observed_variance(sums, bread, correlation)
         hidden = (options.hidden * sums.depth * sums.change) ** 2
-        hidden_correlation = np.exp(-0.5 * distance / options.reach) + options.offset**2
+        hidden_correlation = np.exp(-0.5 * distance / _REACH) + options.offset**2
         B += (
             sums.responses.T
             @ (observed * correlation + hidden * hidden_correlation)
@@ -241,10 +234,10 @@ def covariance(
     source, targets, alignment
         As given to `align`, which returned `aligned`.
     options
-        Constants of the covariance; the calibrated ones unless given.
+        Systematic errors of the views; those of one camera unless given.
     """
-    constants = options or UncertaintyOptions()
-    C = covariance_of_patches(patches(source, targets, aligned, alignment, constants), constants)
+    sums = patches(source, targets, aligned, alignment)
+    C = covariance_of_patches(sums, options or UncertaintyOptions())
     prior = np.array([alignment.prior_m] * 3 + [alignment.prior_rad] * 3)
     return with_prior(bounded_by_prior(C, prior), aligned.unobservable, prior)
 
@@ -300,14 +293,14 @@ def _observed_variance(sums: Patches, bread: Float64, correlation: Float64) -> f
     return max(surplus, 0.0) / max(expected, 0.1 * float(weights.sum()))
 
 
-def _hessian(sums: Patches, options: UncertaintyOptions) -> Float64:
-    """Return X (7, 7), bounded below by `steepness` times its value without robust weights.
+def _hessian(sums: Patches) -> Float64:
+    """Return X (7, 7), bounded below by `_STEEPNESS` times its value without robust weights.
 
     For normal errors the ratio is two thirds. With many residuals near the limit of the loss, X is
     a difference of large numbers and may even be negative.
     """
-    min_eigenvalue = _MIN_INFORMATION * options.max_sigma**-2
-    return bounded_below(sums.cross, sums.weighted, options.steepness, min_eigenvalue)
+    min_eigenvalue = _MIN_INFORMATION * _MAX_SIGMA**-2
+    return bounded_below(sums.cross, sums.weighted, _STEEPNESS, min_eigenvalue)
 
 
 def bounded_below(
@@ -324,8 +317,8 @@ def bounded_below(
     return np.asarray((basis * np.maximum(values, fraction)) @ basis.T, np.float64)
 
 
-def _with_weak_prior(X: Float64, max_sigma: float) -> tuple[Float64, Float64]:
-    """Raise the eigenvalues of X (7, 7) to ``max_sigma**-2``; return it, and the prior's B (7, 7).
+def _with_weak_prior(X: Float64) -> tuple[Float64, Float64]:
+    """Raise the eigenvalues of X (7, 7) to ``_MAX_SIGMA**-2``; return it, and the prior's B (7, 7).
 
     The information added to X is that of a prior, which counts in B as well: without it, the
     variance ``B / X**2`` would decrease the less a direction is constrained.
@@ -335,9 +328,9 @@ def _with_weak_prior(X: Float64, max_sigma: float) -> tuple[Float64, Float64]:
         X[6, :] = X[:, 6] = 0.0
         X[6, 6] = 1.0
     values, vectors = np.linalg.eigh(X)
-    missing = np.maximum(max_sigma**-2 - values, 0.0)
+    missing = np.maximum(_MAX_SIGMA**-2 - values, 0.0)
     raised: Float64 = X + (vectors * missing) @ vectors.T
-    prior: Float64 = (vectors * np.minimum(missing, max_sigma**-2)) @ vectors.T
+    prior: Float64 = (vectors * np.minimum(missing, _MAX_SIGMA**-2)) @ vectors.T
     return raised, prior
 
 
