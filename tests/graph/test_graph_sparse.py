@@ -9,12 +9,13 @@ import pytest
 from threadpoolctl import ThreadpoolController
 
 from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.connections import parts_of
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import sparse
 from tofuse.engine.graph.graph import PoseGraph
 from tofuse.engine.graph.graph_covariances import GraphCovariances
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
-from tofuse.engine.graph.sparse import factor_size, parts_of, sparsify
+from tofuse.engine.graph.sparse import factor_size, sparsify
 
 PLACES, ROUNDS = 30, 20
 LIMIT = 400_000  # the factor of all pairs has about twice as many values

@@ -10,9 +10,10 @@ import numpy as np
 
 from tofuse.apps.certainty.surfaces import Seen, Surfaces, pair_information, scales
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
+from tofuse.engine.connections import parts_of
 from tofuse.engine.frames import Frame, RangeFrame, evenly_spaced
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import PoseGraph, graph_covariances, sparse
+from tofuse.engine.graph import PoseGraph, graph_covariances
 from tofuse.engine.progress import OnlineMap
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.refinement import joint_alignment, pairwise_measurements
@@ -95,7 +96,7 @@ class Known:
         is_open = np.isin(graph.ids, [*known.degenerate])
         ends = is_open[graph.edges]
         bounded = ~np.where(graph.loop, ends.any(1), ends[:, 1])
-        parts = sparse.parts_of(len(graph.ids), graph.edges[bounded])
+        parts = parts_of(len(graph.ids), graph.edges[bounded])
         found = cls._of_graph(
             graph, positions, known.timestamps, surfaces, centre, each, sampled, parts
         )

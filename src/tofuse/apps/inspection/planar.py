@@ -27,12 +27,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 from scipy.special import ndtr, stdtrit  # scipy.stats takes long to import
 
 from tofuse.engine.arrays import Bool, Float64, Int64
 from tofuse.engine.compute import tukey_kernels as tukey
+from tofuse.engine.connections import parts_of
 from tofuse.engine.normal import robust_sigma
 from tofuse.engine.views import PreparedView
 
@@ -133,10 +132,8 @@ def _labels(view: PreparedView, is_valid: Bool) -> Int64:
         is_same &= (normals[a] * normals[b]).sum(-1) > _MIN_NORMAL_COSINE
         predicted_w = (planes[b][..., :2] * rays[a]).sum(-1) + planes[b][..., 2]
         is_same &= np.abs(predicted_w - planes[a][..., 3]) < tolerance[a] * planes[a][..., 3]
-        links.append((number[a][is_same], number[b][is_same]))
-    i, j = np.concatenate(links, axis=1)
-    graph = sparse.coo_matrix((np.ones(len(i), bool), (i, j)), shape=(number.size,) * 2)
-    return connected_components(graph, directed=False)[1].reshape(is_valid.shape).astype(np.int64)
+        links.append(np.stack([number[a][is_same], number[b][is_same]], 1))
+    return parts_of(number.size, np.concatenate(links)).reshape(is_valid.shape)
 
 
 @dataclass(frozen=True, eq=False)

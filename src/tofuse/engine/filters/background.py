@@ -9,11 +9,10 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32
 from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.connections import parts_of
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.base import Filter
 from tofuse.engine.frames import Frame, RangeFrame
@@ -367,10 +366,8 @@ def _segments(z: Float32) -> Int32:
             connected = np.abs(z[a] - z[b]) <= _JUMP * np.minimum(z[a], z[b])
         connected |= np.isinf(z[a]) & np.isinf(z[b])
         connected &= (z[a] > 0) & (z[b] > 0)
-        pairs.append(np.stack([pixel[a][connected], pixel[b][connected]]))
-    i, j = np.concatenate(pairs, axis=1)
-    graph = coo_array((np.ones(len(i), np.int8), (i, j)), shape=(z.size, z.size))
-    _, label = connected_components(graph, directed=False)
+        pairs.append(np.stack([pixel[a][connected], pixel[b][connected]], 1))
+    label = parts_of(z.size, np.concatenate(pairs))
     return np.where(z > 0, label.reshape(z.shape) + 1, 0).astype(np.int32)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, Int32, Intp
+from tofuse.engine.connections import parts_of
 from tofuse.engine.fusion.atlas_kernels import NO_TRIANGLE, draw_triangles
 from tofuse.engine.fusion.mesh import Mesh
 
@@ -139,18 +140,13 @@ def chart_atlas(faces: Int32, label: Int32, pixels: Float32, size: int) -> Atlas
 
 def _connected(faces: Int32, label: Int32) -> Int32:
     """Return the number (M,) of the chart of each triangle."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    count = len(faces)
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1).astype(np.int64)
     key = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
     order = np.argsort(key, kind="stable")
     shared = np.flatnonzero(key[order[1:]] == key[order[:-1]])
     a, b = order[shared] // 3, order[shared + 1] // 3
     same = label[a] == label[b]
-    joined = coo_array((np.ones(same.sum(), bool), (a[same], b[same])), shape=(count, count))
-    return np.asarray(connected_components(joined, directed=False)[1], np.int32)
+    return parts_of(len(faces), np.stack([a[same], b[same]], 1)).astype(np.int32)
 
 
 def _on_shelves(extent: Intp, edge: int) -> tuple[Intp, int]:

@@ -15,10 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64, Intp
+from tofuse.engine.connections import parts_of
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import ROUNDING, Optimisation, PoseGraph
 from tofuse.engine.graph.minimisation import Problem
-from tofuse.engine.graph.sparse import Factor, first_of_parts, parts_of, sparsify
+from tofuse.engine.graph.sparse import Factor, first_of_parts, sparsify
 
 # Levels of a branch that are removed: of a chain without loops one end at a time.
 _LEVELS = 8

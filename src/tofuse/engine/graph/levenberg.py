@@ -9,13 +9,14 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
+from tofuse.engine.connections import parts_of
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import GraphPart, Optimisation, Optimiser, PoseGraph
 from tofuse.engine.graph.graph_covariances import Branches
 from tofuse.engine.graph.robust import MEDIAN, Robust, Settings
 from tofuse.engine.graph.solver import Solution, solve
-from tofuse.engine.graph.sparse import parts_of, sparsify
+from tofuse.engine.graph.sparse import sparsify
 from tofuse.engine.parts import part
 
 _RIGID = 1e-3  # largest deviation of a rotation from orthonormal

@@ -17,11 +17,12 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.sparse.linalg import splu
 
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.compute import one_blas_thread
+from tofuse.engine.connections import parts_of
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import edge_kernels
 from tofuse.engine.graph import supernode_kernels as kernels
@@ -329,15 +330,6 @@ class Factor:
         blocks = values[places]
         n = len(self.system.free)
         return blocks[:n], blocks[n:]
-
-
-def parts_of(n: int, pairs: Intp) -> Intp:
-    """Return the (n,) connected part of each vertex, numbered in the order of first vertices."""
-    i, j = np.asarray(pairs, np.intp).reshape(-1, 2).T
-    adjacency = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
-    _, label = connected_components(adjacency, directed=False)
-    _, first, part = np.unique(label, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[part]
 
 
 def first_of_parts(n: int, pairs: Intp) -> Bool:

@@ -17,10 +17,11 @@ from typing import Literal
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import dijkstra
 
 from tofuse.engine.alignment import Link, Registration
 from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.connections import parts_of
 from tofuse.engine.geometry import retract, se3, twist_between
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.engine.search import DISTINCT_M, DISTINCT_RAD
@@ -451,10 +452,8 @@ def sides_without(edges: Sequence[Edge], k: int) -> Sides:
     """The nodes that are connected with either end of edge k without it."""
     nodes = sorted({node for edge in edges for node in edge})
     row = {node: n for n, node in enumerate(nodes)}
-    remaining = np.array([(row[a], row[b]) for n, (a, b) in enumerate(edges) if n != k], np.intp)
-    remaining = remaining.reshape(-1, 2)
-    graph = csr_array((np.ones(len(remaining)), tuple(remaining.T)), shape=(len(nodes), len(nodes)))
-    _, label = connected_components(graph, directed=False)
+    remaining = [(row[a], row[b]) for n, (a, b) in enumerate(edges) if n != k]
+    label = parts_of(len(nodes), remaining)
     first, second = (
         frozenset(node for node in nodes if label[row[node]] == label[row[end]]) for end in edges[k]
     )

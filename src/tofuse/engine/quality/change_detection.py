@@ -20,12 +20,11 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Intp
 from tofuse.engine.compute import run_all
+from tofuse.engine.connections import parts_of
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import robust_sigma
@@ -275,7 +274,5 @@ def _clusters(points: Float64, voxel: float) -> list[Float64]:
     if not len(points):
         return []
     pairs = cKDTree(points).query_pairs(_CLUSTER_GAP * voxel, output_type="ndarray")
-    n = len(points)
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    count, label = connected_components(graph, directed=False)
-    return [points[label == k] for k in range(count)]
+    label = parts_of(len(points), pairs)
+    return [points[label == k] for k in range(label.max() + 1)]

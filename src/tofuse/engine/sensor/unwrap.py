@@ -22,12 +22,11 @@ from typing import Annotated, Self
 import numpy as np
 import scipy  # loads its parts when they are used
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Intp
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute import run_chunks
+from tofuse.engine.connections import parts_of
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
 from tofuse.engine.sensor.base import FrameCorrection
@@ -289,10 +288,8 @@ def _shift_surfaces(
         difference = unwrapped[b] - unwrapped[a]
         edge_cost = difference_cost(difference)
         connected = edge_cost < options.max_difference_cost
-        graph = coo_array(
-            (np.ones(connected.sum()), (a[connected], b[connected])), (index.size, index.size)
-        )
-        count, surface = connected_components(graph, directed=False)
+        surface = parts_of(index.size, np.stack([a[connected], b[connected]], 1))
+        count = int(surface.max()) + 1
         crossing = surface[a] != surface[b]
         surface_a, surface_b = surface[a][crossing], surface[b][crossing]
         at_boundary, boundary_cost = difference[crossing], edge_cost[crossing]

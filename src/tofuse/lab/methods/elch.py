@@ -13,8 +13,9 @@ from scipy import sparse as scipy_sparse
 from scipy.sparse.csgraph import dijkstra
 
 from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.connections import parts_of
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Optimisation, Optimiser, PoseGraph, levenberg, sparse
+from tofuse.engine.graph import Optimisation, Optimiser, PoseGraph, levenberg
 from tofuse.engine.parts import part
 
 _MIN_RELATIVE_LENGTH = 1e-12  # min edge length relative to the largest
@@ -49,7 +50,7 @@ class Elch(Optimiser):
                 poses = _distribute(poses, graph, loop, fractions[0], fractions[1])
                 history.append(graph.with_poses(poses).chi2())
             included[loop] = True
-        component = sparse.parts_of(len(poses), graph.edges)
+        component = parts_of(len(poses), graph.edges)
         for k in range(int(component.max(initial=-1)) + 1):
             members = np.flatnonzero(component == k)
             first = graph.poses[members[0]]
