@@ -23,6 +23,7 @@ from tofuse.engine.mapping import reconstructing
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.refinement import joint_alignment, pairwise_measurements, propagate_poses
 from tofuse.engine.stored_views import SampledView, Spacing, pair_equations
+from tofuse.engine.times import nearest
 from tofuse.formats.rigs import RigSource
 
 # Spacing of views, as for a single camera, and their number of points.
@@ -145,7 +146,7 @@ def _rig_estimates(
         T, valid = track.at(times)
         T_world_rig = T @ se3.inverse(stated.T_rig_camera)
         poses.append(np.where(valid[:, None, None], T_world_rig, np.nan))
-        information.append(by_pose[np.abs(track.times[None] - times[:, None]).argmin(1)])
+        information.append(by_pose[nearest(track.times, times)])
     if not poses:
         raise InputError("no camera has a trajectory", where="the rig")
     return np.stack(poses), np.stack(information)

@@ -30,6 +30,7 @@ from tofuse.engine.noise import noise_model_for
 from tofuse.engine.normal import robust_sigma
 from tofuse.engine.progress import Progress
 from tofuse.engine.stored_views import SampledView
+from tofuse.engine.times import nearest
 from tofuse.engine.views import PreparedView
 from tofuse.formats.recordings import still
 from tofuse.formats.rigs import Rig, RigCamera
@@ -197,7 +198,7 @@ def _costs_of_lags(
     """
     stamps = camera.recording.timestamps + offset
     shifts = np.arange(-_MAX_LAG, _MAX_LAG + 1)
-    rows = np.abs(stamps - times[:, None]).argmin(1)[:, None] + shifts
+    rows = nearest(stamps, times)[:, None] + shifts
     inside = (rows >= 0) & (rows < len(stamps))
     views: dict[int, SampledView | None] = {}
     for row in np.unique(rows[inside]).tolist():
@@ -277,14 +278,10 @@ def _views_by_instant(
 
 def _views_at(camera: Camera, offset: float, times: Float64) -> list[PreparedView | None]:
     """Return the views of a camera at the rig's times; None where it has none."""
-    timestamps = camera.recording.timestamps + offset
-    nearest = np.abs(timestamps[None] - times[:, None]).argmin(1)
-    differences = np.abs(timestamps[nearest] - times)
-    row: list[PreparedView | None] = []
-    for k, difference in zip(nearest, differences, strict=True):
-        frame = camera.image(int(k)) if difference <= _MAX_INTERVALS * _interval(camera) else None
-        row.append(None if frame is None else camera.surface(frame))
-    return row
+    limit = _MAX_INTERVALS * _interval(camera)
+    rows = nearest(camera.recording.timestamps + offset, times, limit).tolist()
+    frames = [camera.image(row) if row >= 0 else None for row in rows]
+    return [None if frame is None else camera.surface(frame) for frame in frames]
 
 
 def _is_dynamic(camera: Camera) -> bool:

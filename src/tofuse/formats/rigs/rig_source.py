@@ -12,6 +12,7 @@ from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, RangeFrame, Recording, Source
+from tofuse.engine.times import nearest
 from tofuse.formats.rigs.rig_file import Rig
 
 # Largest time difference within an instant, as a fraction of the frame interval.
@@ -83,19 +84,14 @@ class RigSource:
             for recording, camera in zip(self._recordings, self.rig.cameras, strict=True)
         ]
         single = all(len(t) == 1 for t in times)
-        rows: list[tuple[int, int, int]] = []
-        instant = 0
-        for k, t in enumerate(times[0]):
-            images = [(0, k)]
-            for c, other in enumerate(times[1:], 1):
-                nearest = int(np.abs(other - t).argmin())
-                interval = float(np.median(np.diff(other))) if len(other) > 1 else 0.0
-                if single or abs(other[nearest] - t) <= _SAME_INSTANT * interval:
-                    images.append((c, nearest))
-            if len(images) == len(times):
-                rows += [(instant, c, row) for c, row in images]
-                instant += 1
-        return np.array(rows, np.intp).reshape(-1, 3)
+        intervals = [float(np.median(np.diff(t))) if len(t) > 1 else 0.0 for t in times]
+        limits = [np.inf if single else _SAME_INSTANT * interval for interval in intervals]
+        others = zip(times[1:], limits[1:], strict=True)
+        table = np.stack(
+            [np.arange(len(times[0])), *(nearest(t, times[0], limit) for t, limit in others)], 1
+        )
+        table = table[(table >= 0).all(1)]
+        return np.stack([*np.indices(table.shape), table], -1).reshape(-1, 3)
 
     @property
     def T_rig_camera(self) -> Float64:
