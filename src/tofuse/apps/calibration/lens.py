@@ -62,8 +62,8 @@ class LensFit:
         Rms reprojection error of the corners.
     rms_px_before
         The same for the recording's original lens.
-    views, rms_by_view_px
-        Frames that were used, and the rms reprojection error of each.
+    views
+        Frames that were used.
     left_out
         Frames that were not used, each with the reason.
     covered
@@ -77,7 +77,6 @@ class LensFit:
     rms_px: float
     rms_px_before: float
     views: tuple[int, ...]
-    rms_by_view_px: tuple[float, ...]
     left_out: tuple[tuple[int, str], ...]
     covered: float
     warnings: tuple[str, ...] = ()
@@ -172,7 +171,6 @@ def calibrate_lens(
         _rms(rms),
         _rms(np.array(original_errors)) if original_errors else float("nan"),
         tuple(view.index for view in views),
-        tuple(float(r) for r in rms),
         tuple(sorted(left_out)),
         covered,
         tuple(_warnings(fit, covered, len(views))),

@@ -71,8 +71,6 @@ class TrajectoryError:
         (4, 4) the alignment: maps the estimate's world into the reference's.
     pairs
         (A, 2) rows of the associated poses in the estimate and in the reference.
-    position_errors
-        (A, 3) aligned estimate minus reference, m, in the reference's world.
     estimated
         Number of estimated poses, associated or not.
     """
@@ -85,7 +83,6 @@ class TrajectoryError:
     relative: tuple[RelativeError, ...]
     T_reference_estimate: Float64
     pairs: Intp
-    position_errors: Float64
     estimated: int
 
     @property
@@ -164,7 +161,6 @@ def evaluate_trajectory(
         relative=tuple(relative_error(T_estimate, T_reference, k) for k in RPE_FRAMES),
         T_reference_estimate=T_align,
         pairs=pairs,
-        position_errors=errors,
         estimated=int(np.isfinite(estimate).all((1, 2)).sum()),
     )
 

@@ -17,6 +17,7 @@ from tofuse.engine.compute import median
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.views.prepared_view import PreparedView
 from tofuse.engine.views.view_planes import (
+    MISFIT,
     SurfaceOptions,
     edge_pixels_by_noise,
     fitted_planes,
@@ -77,7 +78,7 @@ def _with_planes_at_noisy_pixels(
     edge = edge_pixels_by_noise(w, noise, options)
     missing = missing & ~edge
     weight = inverse((noise * w) ** 2, (w > 0) & ~edge)
-    limit = options.misfit * max(1.0, scale_at(options.flatness, surface.z, surface.sigma))
+    limit = MISFIT * max(1.0, scale_at(options.flatness, surface.z, surface.sigma))
     planes, quality = fitted_planes(w, surface.rays, weight, missing, limit, options)
     new = missing & (planes[..., 3] > 0)
     shared = shared_sigma(frame, surface.projection.lengths2)

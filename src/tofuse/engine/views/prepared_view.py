@@ -15,6 +15,7 @@ from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.views.projection import Projection, projection_of
 from tofuse.engine.views.residual_kernels import TargetImage, ViewImages, make_target
 from tofuse.engine.views.view_planes import (
+    MISFIT,
     SurfaceOptions,
     edge_pixels,
     fitted_planes,
@@ -42,6 +43,8 @@ _MIN_DEPTH, _MAX_DEPTH = 1e-3, 1e3
 # Lower limit of the noise relative to the depth, for views that are averaged or simulated without
 # noise.
 _MIN_NOISE = 3e-4
+# Half width of the box filter of the albedo, pixels.
+_ALBEDO_RADIUS = 1
 
 # Exponent of the range by which the amplitude of a time-of-flight camera falls off.
 RAW_RANGE_FALLOFF = 2.0
@@ -234,7 +237,7 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
         noise_scale(w, rays, weight, options.radii[0]),
         scale_at(_MIN_NOISE, z, sigma) if stated is None else 1.0,
     )
-    limit = options.misfit * max(scale, scale_at(options.flatness, z, sigma))
+    limit = MISFIT * max(scale, scale_at(options.flatness, z, sigma))
     planes, quality = fitted_planes(w, rays, weight, valid, limit, options)
     albedo = _no_albedo(rows, columns)
     has_albedo = amplitude is not None
@@ -247,7 +250,7 @@ def prepare_view(frame: RangeFrame, options: SurfaceOptions) -> PreparedView:
         )
         run_chunks(
             lambda a, b: smooth_and_slope(
-                raw_albedo, planes, rays, options.albedo_radius, 0.05, albedo, a, b
+                raw_albedo, planes, rays, _ALBEDO_RADIUS, 0.05, albedo, a, b
             ),
             rows,
             row_chunks(rows),

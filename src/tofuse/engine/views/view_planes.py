@@ -40,6 +40,8 @@ _STEEPEST = 5.67
 # Above this difference of x/z between neighbouring pixels, windows shrink: one of the same number
 # of pixels would rarely cover a single surface.
 _COARSE = 0.01
+# Largest ratio of the residual variance of a window to that of the smallest windows.
+MISFIT = 1.2
 
 
 @dataclass(frozen=True)
@@ -79,16 +81,12 @@ class SurfaceOptions:
         light of both sides. An edge is a relative difference above `edge_jump`, above that of
         neighbouring pixels on a surface at an incidence of 80 degrees, and above `edge_sigmas`
         times the view's typical noise.
-    misfit
-        Largest ratio of the residual variance of a window to that of the smallest windows.
     flatness
         Deviations from a plane below this fraction of the depth are accepted regardless of the
         noise of the view, as cameras may smooth their images.
     fill, offset
         Smallest valid fraction of a window, and largest squared offset of its valid pixels'
         centroid relative to their variance.
-    albedo_radius
-        Half width of the box filter of the albedo, pixels.
     falloff
         Exponent of the cosine to the optical axis by which amplitude falls off towards the corners;
         None to estimate it from the recording.
@@ -105,11 +103,9 @@ class SurfaceOptions:
     edge_jump: float = 0.04
     edge_margin: int = 1
     edge_sigmas: float = 3.0
-    misfit: float = 1.2
     flatness: float = 0.002
     fill: float = 0.7
     offset: float = 0.2
-    albedo_radius: int = 1
     falloff: float | None = None
     range_falloff: float | None = None
     fine_scale: FineScale = FineScale()
