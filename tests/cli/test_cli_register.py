@@ -278,7 +278,7 @@ def made(T: np.ndarray, **more: object) -> Registration:
     ("more", "status", "says"),
     [
         ({"believed": True, "probability": 0.97}, 0, "accepted: probability 97 %"),
-        ({"believed": True, "probability": 0.9999}, 0, "accepted: probability above 99 %"),
+        ({"believed": True, "probability": 0.9999}, 0, "accepted: probability over 99.9 %"),
         (
             {"believed": True, "probability": 0.97, "given_guess": True},
             0,

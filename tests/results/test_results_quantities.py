@@ -2,7 +2,7 @@
 
 import pytest
 
-from tofuse.engine.quantities import length, percent
+from tofuse.engine.quantities import length, percent, probability
 
 
 def test_length_has_two_or_three_digits_that_matter():
@@ -21,4 +21,5 @@ def test_percent_has_a_decimal_where_it_matters(fraction, text):
 
 def test_all_is_not_claimed_for_less():
     assert (percent(0.9999), percent(1.0), percent(1.2)) == ("99.9 %", "100 %", "120 %")
+    assert [probability(p) for p in (0.0, 0.97, 1.0)] == ["below 0.1 %", "97 %", "over 99.9 %"]
     assert percent(None) == percent(float("nan")) == "–"

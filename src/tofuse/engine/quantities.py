@@ -1,8 +1,10 @@
-"""Lengths and fractions as text, by one rule in messages, tables and the report."""
+"""Quantities as text, by one rule in messages, tables and the report."""
 
 from __future__ import annotations
 
 import math
+
+MAX_PROBABILITY = 0.999  # higher ones can't be justified by any model
 
 
 def length(metres: float | None) -> str:
@@ -20,3 +22,16 @@ def percent(fraction: float | None) -> str:
         return "–"
     percents = min(100 * fraction, 99.9) if fraction < 1 else 100 * fraction
     return f"{round(percents, int(percents < 10 or percents > 99)):g} %"
+
+
+def probability(value: float) -> str:
+    """Return a probability as text, no closer to 0 and 1 than can be justified: "over 99.9 %"."""
+    if value >= MAX_PROBABILITY:
+        return f"over {percent(MAX_PROBABILITY)}"
+    limit = 1 - MAX_PROBABILITY
+    return f"below {percent(limit)}" if value < limit else percent(value)
+
+
+def count(number: int, noun: str) -> str:
+    """Return a number of things as text: "1 frame", "12,000 points"."""
+    return f"{number:,} {noun}" + ("" if number == 1 else "s")

@@ -26,6 +26,7 @@ from tofuse.apps.cli.progress import escaped
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
+from tofuse.engine.quantities import count
 from tofuse.engine.sensor import DepthCorrection
 from tofuse.formats.cameras import camera_file, read_correction, write_correction, write_noise
 from tofuse.formats.files import atomic
@@ -65,8 +66,8 @@ def noise(arguments: Noise) -> int:
         arguments,
         fit.to_dict(),
         table,
-        f"{escaped(fit.model.name)}, {fit.frames} frames in {fit.stretches} static "
-        f"segment{'' if fit.stretches == 1 else 's'}: the noise model over {fit.law} deviates by "
+        f"{escaped(fit.model.name)}, {fit.frames} frames in "
+        f"{count(fit.stretches, 'static segment')}: the noise model over {fit.law} deviates by "
         f"{100 * fit.rms_log_error:.0f} % rms "
         f"(built-in model: {100 * fit.rms_log_error_before:.0f} %)",
         *warning_lines(fit.warnings),

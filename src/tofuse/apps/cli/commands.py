@@ -18,6 +18,7 @@ from rich.table import Table
 from tofuse.apps.cli import options as cli
 from tofuse.apps.cli.progress import emit, escaped, progress_for
 from tofuse.engine.errors import InputError
+from tofuse.engine.quantities import count
 from tofuse.engine.results import Reason, Reconstruction
 from tofuse.engine.stopwatch import timing
 
@@ -333,7 +334,7 @@ def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     parts = [f"{counts['tracked']} of {len(d.frames)} frames tracked"]
     parts += [f"{counts[s]} {s}" for s in ("predicted", "lost") if counts[s]]
     parts += [f"{skipped} unreadable"] if skipped else []
-    parts += [f"{closures} loop{'' if closures == 1 else 's'} closed"]
+    parts += [f"{count(closures, 'loop')} closed"]
     parts += [f"{len(result.cloud):,} points"]
     components = [
         f"and {_page_of(out / folders.component_name(number))}, for "
@@ -510,7 +511,7 @@ def evaluate(arguments: cli.Evaluate) -> int:
         if r.pairs:
             angle = r.to_dict()["rotation_rms_deg"]
             value = f"{r.translation_rms_m:.4f} m, {angle:.3f} deg"
-        table.add_row(f"RPE over {r.frames} frame{'' if r.frames == 1 else 's'}", value)
+        table.add_row(f"RPE over {count(r.frames, 'frame')}", value)
     if evaluation.consistency is not None:
         m = data["map_consistency"]
         value = "no two images overlap enough"
@@ -566,10 +567,9 @@ def _optimised(graph: PoseGraph, solution: Optimisation, kept: Bool) -> Iterator
         f"to {solution.graph.chi2():.6g} in {max(len(solution.objective) - 1, 0)} iterations"
         + ("" if solution.converged else " (not converged)")
     )
-    count = int((~kept).sum())
-    if count:
+    if rejected := int((~kept).sum()):
         yield (
-            f"{count} edge{'' if count == 1 else 's'} rejected as inconsistent with the others; "
+            f"{count(rejected, 'edge')} rejected as inconsistent with the others; "
             f"squared error of the others {graph.chi2(kept):.6g} to {solution.graph.chi2(kept):.6g}"
         )
     for piece in solution.parts if len(solution.parts) > 1 else ():

@@ -49,7 +49,7 @@ from tofuse.engine.quality import (
     pose_deviation,
     trajectory_errors,
 )
-from tofuse.engine.quantities import length
+from tofuse.engine.quantities import count, length
 from tofuse.engine.refinement import Joint, propagate_poses
 from tofuse.engine.results import Reason, Reconstruction, Verdict, accuracy_card, checks, verdicts
 from tofuse.engine.stored_views import PosedView, Spacing
@@ -782,7 +782,7 @@ def _contradiction(
         a, b = steps[0]
         text += f" The motion from frame {a} to {b} is wrong by itself"
         others = len(steps) - 1
-        text += f", and {others} other{'' if others == 1 else 's'}." if others else "."
+        text += f", and {count(others, 'other')}." if others else "."
     if cause is not None:
         text += f" The cause is probably {cause.text}."
     yield Reason("inconsistent_poses", steps or full_range, text)

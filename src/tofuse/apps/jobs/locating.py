@@ -27,6 +27,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.loops import locating
 from tofuse.engine.mapping import Config, adaptation, clips, from_method, kind_of
 from tofuse.engine.progress import Progress
+from tofuse.engine.quantities import probability
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.search import pose_probability
 from tofuse.engine.stored_views import PosedView
@@ -36,7 +37,6 @@ from tofuse.formats.recordings import Opening, OpeningOptions, open_view, split_
 
 # Frames of a clip that are located.
 _LOCATED = 4
-_MAX_STATED = 0.999
 _NOWHERE = "no place in the map resembles it"
 MARKER, TRAJECTORY = "locations.json", "trajectory.txt"
 _CONTRACT = folders.Contract.of_files(MARKER, TRAJECTORY, keys=("frames",))
@@ -330,7 +330,7 @@ def sentence(frame: LocatedFrame) -> str:
         sigma_m, sigma_rad = se3.largest_sigmas(location.covariance).tolist()
         if np.isfinite(sigma_m) and not len(location.unobservable):
             words.append(f"sigma {1e3 * sigma_m:.0f} mm, {np.degrees(sigma_rad):.2f} deg")
-        words.append(f"probability {min(location.probability, _MAX_STATED):.1%}")
+        words.append(f"probability {probability(location.probability)}")
         if location.runner_up is not None:
             apart = np.linalg.norm(location.runner_up[:3, 3] - T[:3, 3])
             words.append(f"runner-up {apart:.2f} m away")

@@ -8,10 +8,10 @@ from itertools import combinations
 
 import numpy as np
 
-from tofuse.apps.report import session_words
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.quality import changes, cross_view_agreement
+from tofuse.engine.quantities import MAX_PROBABILITY
 from tofuse.engine.results import Reconstruction, SessionChange, SessionPair, SessionRecord
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.views import PreparedView
@@ -124,7 +124,7 @@ def _links(
     ends = [(join.link.i, join.link.j) for join in joins]
     ends += [(loop.i, loop.j) for loop in d.loops if loop.accepted and between(loop.i, loop.j)]
     probabilities = [join.probability for join in joins if join.probability is not None]
-    probability = min(max(probabilities, default=0.0), session_words.MAX_STATED_PROBABILITY)
+    probability = min(max(probabilities, default=0.0), MAX_PROBABILITY)
     return len(set(map(frozenset, ends))), probability if probabilities else None
 
 

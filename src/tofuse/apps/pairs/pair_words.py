@@ -9,7 +9,7 @@ from tofuse.apps.pairs.result import PairResult
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.quantities import percent
+from tofuse.engine.quantities import percent, probability
 
 _MIN_AXIS_COSINE = 0.985  # minimum cosine to an axis for a direction to be named after it
 _SMALL_RAD = 1e-6
@@ -20,7 +20,7 @@ def decision(result: PairResult) -> tuple[str, str]:
     registration = result.registration
     parts = []
     if registration.probability is not None:
-        parts.append(f"probability {_probability(registration.probability)}")
+        parts.append(f"probability {probability(registration.probability)}")
     if registration.believed:
         if registration.given_guess:
             near = "identity" if result.guess is None else "guess"
@@ -147,13 +147,6 @@ def runner_up(result: PairResult) -> str:
             f"fits {percent(abs(margin))} {'more' if margin < 0 else 'fewer'} of the points"
         )
     return ", ".join(parts)
-
-
-def _probability(value: float) -> str:
-    """A probability as text, never 0 or 1."""
-    if value > 0.99:
-        return "above 99 %"
-    return "below 1 %" if value < 0.01 else f"{100 * value:.0f} %"
 
 
 def vector(values: ArrayLike, digits: int) -> str:

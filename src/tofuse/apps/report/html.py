@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from tofuse._version import __version__
-from tofuse.apps.report import session_words, words
+from tofuse.apps.report import words
+from tofuse.engine import quantities
 from tofuse.engine.frames import frame_ranges
 from tofuse.formats.files import atomic
 
@@ -89,16 +90,16 @@ def _environment() -> Any:
         loader=loader,
     )
     environment.filters |= {
-        "metres": words.length,
+        "metres": quantities.length,
         "signed": words.signed_length,
         "degrees": math.degrees,
-        "percent": words.percent,
+        "percent": quantities.percent,
         "duration": words.seconds,
-        "things": words.count,
+        "things": quantities.count,
         "more": words.more,
         "coordinates": words.coordinates,
         "frames": lambda ends: words.frame_range(*ends),
-        "probability": session_words.probability_text,
+        "probability": quantities.probability,
         "ranges": lambda ranges: frame_ranges.numbers(ranges).replace("-", "–"),
         "number": "{:,}".format,
         "css": lambda color: f"rgb{tuple(color)}",

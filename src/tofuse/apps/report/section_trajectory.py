@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from tofuse.apps.report import plots, words
+from tofuse.apps.report import plots
 from tofuse.apps.report.subject import Subject, Values
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
+from tofuse.engine.quantities import count
 from tofuse.engine.refinement import calibration_check
 
 _AXES = ("x (right)", "y (down)", "z (forward)", "rotation")
@@ -119,7 +120,7 @@ def optimisation(s: Subject) -> Values:
     figures, text = [], ""
     if len(finite):
         text = f"From {finite[0]:.4g} to {finite[-1]:.4g}"
-        text += f" in {words.count(len(values) - 1, 'iteration')}."
+        text += f" in {count(len(values) - 1, 'iteration')}."
         chart = plots.lines(
             np.arange(len(values), dtype=float),
             {"after": values},

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from tofuse.engine.quantities import percent
+from tofuse.engine.quantities import count, percent, probability
 from tofuse.engine.results import Reconstruction, SessionPair
-
-# Higher probabilities can't be justified by any model.
-MAX_STATED_PROBABILITY = 0.999
 
 
 def session_sentences(result: Reconstruction) -> list[str]:
@@ -27,9 +24,8 @@ def session_sentences(result: Reconstruction) -> list[str]:
         if s.T_main_session is None
     ]
     for pair in result.session_pairs:
-        count = change_counts(result, pair)
-        if count:
-            sentences.append(f"Between {names[pair.a]} and {names[pair.b]} {count}.")
+        if changes := change_counts(result, pair):
+            sentences.append(f"Between {names[pair.a]} and {names[pair.b]} {changes}.")
     return sentences
 
 
@@ -40,25 +36,16 @@ def change_counts(result: Reconstruction, pair: SessionPair) -> str:
     if not counts:
         return ""
     (n, kind), *more = counts
-    return " and ".join(
-        [f"{n} surface{'s' * (n > 1)} {kind}", *(f"{n} {kind}" for n, kind in more)]
-    )
+    return " and ".join([f"{count(n, 'surface')} {kind}", *(f"{n} {kind}" for n, kind in more)])
 
 
 def overlap_evidence(pair: SessionPair) -> list[str]:
     """Return the evidence for an overlap: "86 % of the views", "8 registrations", ..."""
     evidence = [f"{percent(pair.overlap)} of the views"]
     if pair.links:
-        evidence.append(f"{pair.links} registration{'s' * (pair.links > 1)}")
+        evidence.append(count(pair.links, "registration"))
     if pair.probability is not None:
-        evidence.append(f"right with a probability of {probability_text(pair.probability)}")
+        evidence.append(f"right with a probability of {probability(pair.probability)}")
     if pair.support is not None:
         evidence.append(f"{percent(pair.support)} of the overlapping measurements agree")
     return evidence
-
-
-def probability_text(value: float) -> str:
-    """Return a probability as text, no closer to 1 than can be justified: "over 99.9 %"."""
-    if value >= MAX_STATED_PROBABILITY:
-        return f"over {100 * MAX_STATED_PROBABILITY:.1f} %"
-    return f"{100 * value:.1f} %"

@@ -42,11 +42,6 @@ def seconds(value: float) -> str:
     return f"{value:.1f} s" if value < 120 else f"{int(value) // 60} min {int(value) % 60:02d} s"
 
 
-def count(number: int, noun: str) -> str:
-    """Return a number of things as text: "1 frame", "12,000 points"."""
-    return f"{number:,} {noun}" + ("" if number == 1 else "s")
-
-
 def thinned(shown: int, total: int, noun: str) -> str:
     """Return how many of a number of things are shown; empty if that is all."""
     return "" if shown == total else f"{shown:,} of {total:,} {noun} are shown."

@@ -7,6 +7,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from tofuse.engine.quantities import count
+
 Range = tuple[int, int]
 
 # Maximum number of ranges in a line of text; `run.json` has them all.
@@ -60,7 +62,7 @@ def numbers(ranges: Sequence[Range]) -> str:
     listed = [str(a) if a == b else f"{a}-{b}" for a, b in ranges[:_LISTED]]
     more = len(ranges) - len(listed)
     if more:
-        return f"{', '.join(listed)} and {more} more range{'' if more == 1 else 's'}"
+        return f"{', '.join(listed)} and {count(more, 'more range')}"
     return ", ".join(listed)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from tofuse.engine.frames import frame_ranges
 from tofuse.engine.quality import pose_accuracy
-from tofuse.engine.quantities import length
+from tofuse.engine.quantities import count, length
 from tofuse.engine.results.types import Reason, Reconstruction
 from tofuse.engine.results.verdicts import ADVICE, ranked
 
@@ -21,8 +21,8 @@ def card(result: Reconstruction) -> list[str]:
     parts = [bound(d.accuracy, result.cloud.diagonal_m)]
     readable = sum(f.status != "skipped" for f in d.frames)
     closed = sum(p.accepted for p in d.loops)
-    loops = f", {closed} loop{'' if closed == 1 else 's'}"
-    parts.append(f"{int(result.has_pose.sum())} of {readable} frames{loops}")
+    loops = count(closed, "loop")
+    parts.append(f"{int(result.has_pose.sum())} of {readable} frames, {loops}")
     if weakest := weakest_frame(d.accuracy):
         parts.append(f"weakest: {weakest}")
     if d.verdict != "good" and (text := advice(d.reasons)):

@@ -13,6 +13,7 @@ from tofuse.engine.arrays import Float32, Float64, UInt8, UInt16
 from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import AmplitudeKind, DepthKind, Frame, RangeFrame, depth_counts
+from tofuse.engine.quantities import count
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import check_first_size, read_color, read_image
@@ -96,10 +97,10 @@ class FileSource(ABC):
                 self._unread_colors[index] = str(error)
                 first = self._unread_colors[min(self._unread_colors)]
                 others = [line for line in self.warnings if line is not self._unread_note]
-                count = len(self._unread_colors)
+                number = len(self._unread_colors)
                 self._unread_note = (
-                    f"colour can't be read in {count} frame{'' if count == 1 else 's'}, which "
-                    f"{'is' if count == 1 else 'are'} used without, the first: {first}"
+                    f"colour can't be read in {count(number, 'frame')}, which "
+                    f"{'is' if number == 1 else 'are'} used without, the first: {first}"
                 )
                 self.warnings[:] = [*others, self._unread_note]
             return None
