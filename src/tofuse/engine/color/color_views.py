@@ -8,11 +8,12 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from tofuse.engine.arrays import Float32, Float64, UInt8
+from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.cameras import Camera
 from tofuse.engine.color import patch_kernels as kernels
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import homogeneous
+from tofuse.engine.views import interpolated
 
 # Patches of a view, and the pixels of its image: of a larger one every n-th.
 POINTS, _PIXELS = 300, 1_000_000
@@ -91,7 +92,7 @@ class ColorView:
         corners = cv2.goodFeaturesToTrack(image, POINTS, _WEAKEST, distance)
         pixels = np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
         table = camera.rays()
-        rays = _interpolated(table, (pixels + 0.5) * camera.width / image.shape[1] - 0.5)
+        rays = interpolated(table, (pixels + 0.5) * camera.width / image.shape[1] - 0.5)
         grid = np.arange(-_HALF, _HALF + 1) * max(1, round(_WINDOW * camera.width / _HALF / 2))
         offsets = np.stack(np.meshgrid(grid, grid), -1).reshape(-1, 2)
         centre = np.round((pixels + 0.5) * camera.width / image.shape[1] - 0.5).astype(np.intp)
@@ -146,7 +147,7 @@ class ColorView:
 
     def rays_at(self, pixels: Float64) -> Float64:
         """Return the ray coordinates (M, 2) at pixels (M, 2)."""
-        return _interpolated(self.camera.rays(), (pixels + 0.5) / self._zoom - 0.5)
+        return interpolated(self.camera.rays(), (pixels + 0.5) / self._zoom - 0.5)
 
     def project(self, points: Float64) -> Float64:
         """Return the pixels (M, 2) of points (M, 3); NaN behind the camera."""
@@ -209,14 +210,3 @@ def matched(
     found, score = aligned(predicted, 1)
     _, chance = aligned(np.roll(predicted, len(predicted) // 2, 0), _EVERY_BY_CHANCE)
     return found, score, chance
-
-
-def _interpolated(table: Float32, pixels: Float64) -> Float64:
-    """Bilinear interpolation of a table (H, W, C) at pixels (M, 2), linear beyond its border."""
-    limit = np.array(table.shape[1::-1]) - 2
-    first = np.clip(np.floor(pixels), 0, limit).astype(np.intp)
-    a, b = (pixels - first).T[:, :, None]
-    u, v = first.T
-    upper = (1 - a) * table[v, u] + a * table[v, u + 1]
-    lower = (1 - a) * table[v + 1, u] + a * table[v + 1, u + 1]
-    return np.asarray((1 - b) * upper + b * lower, np.float64)

@@ -285,18 +285,6 @@ def sampled_points(view: PreparedView, count: int) -> ViewPoints:
 
 def landing_pixels(view: PreparedView, points: Float64) -> Intp:
     """Return column and row (N, 2) of the pixels that points (N, 3) project to; -1 outside."""
-    lookup, (x0, y0, per_x, per_y) = view.projection.lookup, view.projection.frame
     z = np.where(points[:, 2] > 1e-3, points[:, 2], np.nan)
-    a, b = (points[:, 0] / z - x0) * per_x, (points[:, 1] / z - y0) * per_y
-    rows, columns = lookup.shape[:2]
-    inside = (a >= 0) & (b >= 0) & (a < columns - 1) & (b < rows - 1)
-    a, b = np.where(inside, a, 0), np.where(inside, b, 0)
-    j, i = a.astype(np.intp), b.astype(np.intp)
-    f, g = (a - j)[:, None], (b - i)[:, None]
-    uv = (
-        lookup[i, j] * (1 - f) * (1 - g)
-        + lookup[i, j + 1] * f * (1 - g)
-        + lookup[i + 1, j] * (1 - f) * g
-        + lookup[i + 1, j + 1] * f * g
-    )
-    return np.where(inside[:, None], np.round(uv), -1).astype(np.intp)
+    pixels = view.projection.pixels(points[:, :2] / z[:, None])
+    return np.nan_to_num(pixels.round(), nan=-1).astype(np.intp)

@@ -123,17 +123,9 @@ def resampled(view: PreparedView) -> ResampledView:
     low, high = rays.min(0).astype(float), rays.max(0).astype(float)
     spacing = max(float((high - low).max()) / _GRID_NODES, 1e-6)
     x, y = (np.arange(a, b + spacing, spacing) for a, b in zip(low, high, strict=True))
-    x0, y0, per_x, per_y = view.projection.frame
-    lookup = view.projection.lookup
-    fu = np.clip((x - x0) * per_x, 0, lookup.shape[1] - 1.001)[None, :]
-    fv = np.clip((y - y0) * per_y, 0, lookup.shape[0] - 1.001)[:, None]
-    i, j = fv.astype(int), fu.astype(int)
-    au, av = (fu - j)[..., None], (fv - i)[..., None]
-    pixel = (1 - av) * ((1 - au) * lookup[i, j] + au * lookup[i, j + 1]) + av * (
-        (1 - au) * lookup[i + 1, j] + au * lookup[i + 1, j + 1]
-    )
+    nodes = np.stack(np.meshgrid(x, y), -1)
+    pixel = view.projection.pixels(nodes.reshape(-1, 2)).round().reshape(nodes.shape)
     rows, columns = view.z.shape
-    pixel = np.rint(pixel)
     inside = (pixel >= 0).all(-1) & (pixel[..., 0] < columns) & (pixel[..., 1] < rows)
     u, v = np.where(inside[..., None], pixel, 0).astype(int).transpose(2, 0, 1)
     abc = view.planes[v, u, :3].astype(float)

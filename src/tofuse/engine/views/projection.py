@@ -83,6 +83,13 @@ class Projection:
         scale = np.array([x[0], y[0], 1 / (x[1] - x[0]), 1 / (y[1] - y[0])])
         return cls(_halve_rays(rays, step), lookup, scale)
 
+    def pixels(self, rays: Float64) -> Float64:
+        """Return the pixels (M, 2), u and v, of ray coordinates (M, 2); NaN beyond the table."""
+        nodes = (rays - self.frame[:2]) * self.frame[2:]
+        last = np.array(self.lookup.shape[1::-1]) - 1
+        inside = ((nodes >= 0) & (nodes < last)).all(1)[:, None]
+        return np.where(inside, interpolated(self.lookup, np.where(inside, nodes, 0)), np.nan)
+
     def subsampled(self, step: int) -> Projection:
         """Return the projection of every `step`-th pixel, one object for all views."""
         if step not in self._subsampled:
@@ -91,6 +98,17 @@ class Projection:
             lookup = (self.lookup - np.float32(first)) / np.float32(step)
             self._subsampled[step] = Projection(rays, lookup, self.frame)
         return self._subsampled[step]
+
+
+def interpolated(table: Float32, pixels: Float64) -> Float64:
+    """Interpolate a table (H, W, C) bilinearly at its pixels (M, 2); linearly beyond its border."""
+    limit = np.array(table.shape[1::-1]) - 2
+    first = np.clip(np.floor(pixels), 0, limit).astype(np.intp)
+    a, b = (pixels - first).T[:, :, None]
+    u, v = first.T
+    upper = (1 - a) * table[v, u] + a * table[v, u + 1]
+    lower = (1 - a) * table[v + 1, u] + a * table[v + 1, u + 1]
+    return np.asarray((1 - b) * upper + b * lower, np.float64)
 
 
 _projections: WeakKeyDictionary[Camera, dict[int, Projection]] = WeakKeyDictionary()
