@@ -10,7 +10,7 @@ import numpy as np
 
 from tofuse.apps.mirrors.views import Noise, View
 from tofuse.engine.arrays import Bool, Float64
-from tofuse.engine.geometry import unit_rays
+from tofuse.engine.geometry import tangents, unit_rays
 
 # Planes: number of hypotheses and of points that vote, fewest of them on a plane, and the
 # smallest cosine between its normal and those of its points.
@@ -44,10 +44,7 @@ class Plane:
     @property
     def axes(self) -> Float64:
         """(2, 3) orthonormal axes in the plane."""
-        helper = np.eye(3)[np.argmin(np.abs(self.normal))]
-        first = np.cross(helper, self.normal)
-        first /= np.linalg.norm(first)
-        return np.stack([first, np.cross(self.normal, first)])
+        return tangents(self.normal)
 
     def crossings(self, origin: Float64, rays: Float64) -> Float64:
         """Distance (N,) along unit rays from a point in front; not finite where they miss it."""

@@ -20,7 +20,7 @@ from tofuse.engine.cameras import Camera
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.fusion.mesh import Mesh
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, tangents
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -226,10 +226,7 @@ def _fill(mesh: Mesh, loop: Intp, tree: cKDTree, spacing: float) -> Int32 | None
         # A vertex stands for a square of the spacing.
         if in_plane.sum() * spacing**2 < _RING_FRACTION * 0.75 * np.pi * diameter**2:
             return None
-    x = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    x /= np.linalg.norm(x)
-    flat_rim = (rim - centre) @ np.stack([x, np.cross(normal, x)], 1)
-    corners = triangulated(flat_rim)
+    corners = triangulated((rim - centre) @ tangents(normal).T)
     return None if corners is None else loop[corners].astype(np.int32)
 
 

@@ -23,3 +23,11 @@ def unit_vectors(vectors: ArrayLike) -> Float64:
     """Return vectors (..., n) of length 1, zeros of zeros."""
     vectors = np.asarray(vectors, float)
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
+
+
+def tangents(normals: ArrayLike) -> Float64:
+    """Return two unit vectors (..., 2, 3) perpendicular to each normal (..., 3) and each other."""
+    normals = np.asarray(normals, float)
+    axis = np.eye(3)[np.argmin(np.abs(np.nan_to_num(normals)), axis=-1)]
+    first = unit_vectors(np.cross(axis, normals))
+    return np.stack([first, np.cross(normals, first)], -2)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64, Intp
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, tangents
 from tofuse.engine.graph import edge_kernels, robust
 from tofuse.engine.graph.graph import ROUNDING, Gravity
 from tofuse.engine.graph.sparse import Factor, PairSystem, equations
@@ -58,9 +58,7 @@ class Problem:
             down = self.gravity.vertical(observed)
         # A rotation with down as its third axis; the other two are arbitrary.
         down = down / np.linalg.norm(down)
-        x = np.cross(np.eye(3)[np.argmin(np.abs(down))], down)
-        x /= np.linalg.norm(x)
-        T = se3.pose(np.stack([x, np.cross(down, x), down], axis=1))
+        T = se3.pose(np.stack([*tangents(down), down], axis=1))
         return np.concatenate([poses, T[None]])
 
     def errors(self, poses: Float64) -> tuple[Float64, Float64]:

@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64, Int64
-from tofuse.engine.geometry import KdTree
+from tofuse.engine.geometry import KdTree, tangents
 from tofuse.engine.icp import interfaces, surface_shape
 
 # A quadric through a point has five parameters; the point itself is its first neighbour.
@@ -53,7 +53,7 @@ class Neighbourhood:
     @cached_property
     def tangents(self) -> Float64:
         """(n, 2, 3) two unit tangents per normal; NaN where there is no normal."""
-        return _tangents(self._normals)
+        return tangents(self._normals)
 
     @cached_property
     def principal_curvatures(self) -> PrincipalCurvatures:
@@ -116,7 +116,7 @@ def _fitted_mean_curvature(points: interfaces.Points) -> Float64:
     index, _ = surface_shape.tree_of(view).neighbours(points.points, count)
     near, normals = view.points.astype(np.float64)[index], points.shape.normals
     offsets = near - near.mean(1, keepdims=True)
-    A, w, scale = _quadric(offsets, normals, _tangents(normals))
+    A, w, scale = _quadric(offsets, normals, tangents(normals))
     A = np.concatenate([A, np.ones_like(w)[..., None]], 2)
     At = np.swapaxes(A, 1, 2)
     M, g = At @ A, At @ w[..., None]
@@ -127,14 +127,6 @@ def _fitted_mean_curvature(points: interfaces.Points) -> Float64:
     a, b, c, d, e, _ = x.T
     bend = (1 + e * e) * a - 2 * d * e * b + (1 + d * d) * c
     return np.asarray(-bend / (2 * scale * (1 + d * d + e * e) ** 1.5), np.float64)
-
-
-def _tangents(normals: Float64) -> Float64:
-    """(n, 2, 3) two unit tangents per normal; NaN where there is no normal."""
-    axis = np.eye(3)[np.argmin(np.abs(np.nan_to_num(normals)), axis=1)]
-    first = np.cross(normals, axis)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(normals, first)], axis=1)
 
 
 def _quadric(
