@@ -28,7 +28,7 @@ from tofuse.engine.frames import Recording, Source
 from tofuse.engine.fusion import Textured
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
-from tofuse.engine.mapping import Config, Mapper, from_method, reconstructing, texturing
+from tofuse.engine.mapping import Config, Mapper, from_method, reconstructing
 from tofuse.engine.parts import check_number
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.quality import trajectory_errors
@@ -282,14 +282,8 @@ def merge_files(
         result = merge_sessions(
             sessions, config, seed=options.seed, threads=options.threads, progress=progress
         )
-        texture = texturing.make_texture(
-            joined_recording(sessions)[0],
-            result,
-            config.fusion.texture,
-            options.threads,
-            progress,
-            required=bool(options.texture),
-        )
+        recording, _ = joined_recording(sessions)
+        texture = options.make_texture(recording, result, config, options.threads, progress)
         progress.stage("writing")
         with threadpool_limits(1):
             write_result(result, folder, partial(_report, texture, result), texture)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from tofuse.apps.results import run_json
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, Recording
-from tofuse.engine.fusion import Fusion
+from tofuse.engine.fusion import Fusion, Textured
 from tofuse.engine.mapping import (
     MIN_MEMORY_MB,
     Config,
@@ -17,8 +17,12 @@ from tofuse.engine.mapping import (
     adaptation,
     changed,
     from_method,
+    texturing,
 )
+from tofuse.engine.progress import Progress
+from tofuse.engine.results import Reconstruction
 from tofuse.engine.sensor import range_and_amplitude
+from tofuse.engine.stopwatch import timing
 from tofuse.formats.files import reading
 from tofuse.formats.recordings import OpeningOptions
 
@@ -63,6 +67,24 @@ class ModelOptions:
             if value is not None:
                 config = changed(config, changes, where=f"--{option}")
         return config
+
+    @timing("texture")
+    def make_texture(
+        self,
+        recording: Recording,
+        result: Reconstruction,
+        config: Config,
+        threads: int | None,
+        progress: Progress,
+    ) -> Textured | None:
+        """Make the texture unless none is wanted; with a note if one is required and impossible."""
+        size, required = config.fusion.texture, bool(self.texture)
+        texture = texturing.make_texture(
+            recording, result, size, threads, progress, required=required
+        )
+        if texture is None and required:
+            progress.note("no texture: there is no surface, or neither colour nor amplitude")
+        return texture
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,8 @@ from tofuse.apps.results import folders, run_json, write_result
 from tofuse.engine.compute import threads, trim_memory
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
-from tofuse.engine.fusion import texture
 from tofuse.engine.loops import PriorLoop
-from tofuse.engine.mapping import Config, adaptation, reconstructing, texturing
+from tofuse.engine.mapping import Config, adaptation, reconstructing
 from tofuse.engine.normal import OF_99_PERCENT
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import (
@@ -84,7 +83,9 @@ def run(
                     progress.note(note)
             if options.mirrors:
                 result = _without_mirrors(job, result, options, progress)
-            texture = _texture(job, result, options, progress)
+            texture = options.make_texture(
+                job.recording, result, job.config, options.threads, progress
+            )
             result = with_findings(result, job.findings, turning=options.object)
             opening = job.opening.to_dict()
             result = replace(result, recording={**result.recording, "opening": opening})
@@ -167,20 +168,6 @@ def _without_mirrors(
     for sentence in sentences(result):
         progress.note(sentence)
     return result
-
-
-@timing("texture")
-def _texture(
-    job: _Job, result: Reconstruction, options: Options, progress: Progress
-) -> texture.Textured | None:
-    """Make the texture unless none is wanted; with a note if one is required and impossible."""
-    size, required = job.config.fusion.texture, bool(options.texture)
-    texture = texturing.make_texture(
-        job.recording, result, size, options.threads, progress, required=required
-    )
-    if texture is None and required:
-        progress.note("no texture: there is no surface, or neither colour nor amplitude")
-    return texture
 
 
 @timing("opening")

@@ -24,7 +24,7 @@ from tofuse.engine.fusion import Textured
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import Measured
 from tofuse.engine.loops import Nearby
-from tofuse.engine.mapping import Config, adaptation, reconstructing, texturing
+from tofuse.engine.mapping import Config, adaptation, reconstructing
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.refinement import AlreadyRefined, NoRefinement
@@ -89,13 +89,8 @@ def run_rig(
             result = reconstruct_rig(
                 cameras, recording, config, seed=options.seed or 0, progress=progress
             )
-            texture = texturing.make_texture(
-                recording,
-                result.result,
-                config.fusion.texture,
-                options.threads,
-                progress,
-                required=bool(options.texture),
+            texture = options.make_texture(
+                recording, result.result, config, options.threads, progress
             )
             progress.stage("writing")
             _write(result, recording, folder, texture, share=options.share)

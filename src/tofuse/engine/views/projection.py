@@ -87,7 +87,7 @@ class Projection:
         """Return the pixels (M, 2), u and v, of ray coordinates (M, 2); NaN beyond the table."""
         nodes = (rays - self.frame[:2]) * self.frame[2:]
         last = np.array(self.lookup.shape[1::-1]) - 1
-        inside = ((nodes >= 0) & (nodes < last)).all(1)[:, None]
+        inside = ((nodes >= 0) & (nodes < last)).all(1, keepdims=True)
         return np.where(inside, interpolated(self.lookup, np.where(inside, nodes, 0)), np.nan)
 
     def subsampled(self, step: int) -> Projection:

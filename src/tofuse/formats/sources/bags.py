@@ -511,8 +511,7 @@ class _Edge:
         inside = (span <= _MAX_GAP_S) & (fraction >= 0) & (fraction <= 1)
         nearest = np.minimum(np.abs(times - self.times[a]), np.abs(times - self.times[b]))
         valid = np.where(a == b, nearest <= _MAX_EXTRAPOLATION_S, inside)
-        step = se3.log(se3.inverse(self.T[a[valid]]) @ self.T[b[valid]])
-        out[valid] = self.T[a[valid]] @ se3.exp(fraction[valid, None] * step)
+        out[valid] = se3.interpolate(self.T[a[valid]], self.T[b[valid]], fraction[valid])
         return out
 
 
