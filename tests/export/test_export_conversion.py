@@ -23,6 +23,7 @@ from tofuse.engine.noise.model import family_of
 from tofuse.formats.cameras import read_noise, write_noise
 from tofuse.formats.export.conversion import convert
 from tofuse.formats.readers.native import NativeSource
+from tofuse.formats.recordings import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
 
 CHANNELS = ("amplitude_image", "confidence_image", "color_image")
@@ -137,15 +138,17 @@ def test_convert_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert not (tmp_path / "new").exists()
 
 
-def test_failed_conversion_leaves_nothing(tmp_path: Path) -> None:
+def test_failed_conversion_leaves_nothing(tmp_path: Path, monkeypatch) -> None:
     made_arrays.make_npz(tmp_path / "a.npz")
     recording = open_recording(tmp_path / "a.npz")
 
-    def stop(_count: int) -> None:
+    def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        convert(recording, tmp_path / "out", stop)
+    with monkeypatch.context() as patch:
+        patch.setattr(RecordingWriter, "add", stop)
+        with pytest.raises(KeyboardInterrupt):
+            convert(recording, tmp_path / "out")
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputError, match="is a file"):

@@ -185,12 +185,10 @@ class Locator:
     ----------
     views
         The views of the map, with poses T_map_camera.
-    search
-        Range and effort of a search.
     """
 
-    def __init__(self, views: Sequence[View], search: SearchOptions | None = None) -> None:
-        self._views, self._search = views, search or SearchOptions("auto")
+    def __init__(self, views: Sequence[View]) -> None:
+        self._views = views
         self._poses = np.stack([v.T_component_camera for v in views])
         self._depths = np.array([v.depth for v in views])
         self._index = view_descriptors.DescriptorIndex(
@@ -323,7 +321,7 @@ class Locator:
             self._views[place.k].view,
             se3.inverse(T_map_k) @ place.T_map_view if place.score > _MIN_SCORE else None,
             fit_statistics=self._fit_statistics,
-            options=self._search,
+            options=SearchOptions("auto"),
             rival_m=DISTINCT_M,
         )
         if registration is not None:

@@ -3,8 +3,7 @@
 The quality of fit at the right pose depends on the camera: 92 % of the compared pixels are inliers
 for a smoothing phone, two thirds for a stereo camera. Instead of a fixed limit, `FitStatistics`
 estimates the distribution of a few statistics from accepted alignments, starting with a wide prior.
-Alignments beyond `FitStatistics.sigmas` are not rejected, but have to be compared with rival
-poses.
+Unusual alignments are not rejected, but have to be compared with rival poses.
 """
 
 from __future__ import annotations
@@ -37,6 +36,8 @@ _TOLERATED_SIGMAS = 2.0
 # Lower limit of the spread, as the next view may differ from all so far.
 _MIN_SIGMA = np.array([0.3, 0.45, 0.3, 0.35])
 _WINDOW = 200
+# Limit of the usual range above the median, in standard deviations.
+_USUAL_SIGMAS = 3.0
 # Once a camera is known, the distribution is updated every n-th alignment.
 _RELEARN_EVERY = 10
 # Views hardly overlap beyond this distance: the sum of a fraction of the depth and rad.
@@ -90,15 +91,9 @@ class FitStatistics:
 
     Location and spread of each statistic are the median and the scaled median absolute deviation
     over the last alignments, shrunk to the prior while there are few.
-
-    Parameters
-    ----------
-    sigmas
-        Limit of the usual range above the median, in standard deviations.
     """
 
-    def __init__(self, sigmas: float = 3.0) -> None:
-        self._sigmas = sigmas
+    def __init__(self) -> None:
         self._history: deque[Float64] = deque(maxlen=_WINDOW)
         self._mean, self._sigma = _PRIOR_MEAN, _PRIOR_SIGMA
         self._rms: deque[float] = deque(maxlen=_WINDOW)
@@ -155,11 +150,11 @@ class FitStatistics:
         statistics = _statistics(aligned)
         deviation = np.where(np.isfinite(statistics), statistics - self._mean, 0.0)
         worst = int(np.argmax(deviation / self._sigma))
-        if deviation[worst] <= self._sigmas * self._sigma[worst]:
+        if deviation[worst] <= _USUAL_SIGMAS * self._sigma[worst]:
             return FitQuality("usual")
         excess = float(np.maximum(deviation, 0).sum())
         reason = _describe(worst, float(statistics[worst]), float(self._mean[worst]))
-        conflict = np.delete(deviation > self._sigmas * self._sigma, _NOISE).any()
+        conflict = np.delete(deviation > _USUAL_SIGMAS * self._sigma, _NOISE).any()
         return FitQuality("conflicting" if conflict else "noisy", excess, reason)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -39,9 +38,7 @@ class Conversion:
     warnings: tuple[str, ...]
 
 
-def convert(
-    recording: Recording, folder: str | Path, progress: Callable[[int], None] | None = None
-) -> Conversion:
+def convert(recording: Recording, folder: str | Path) -> Conversion:
     """Write a recording as a native folder.
 
     Depth keeps its unit, if the recording has one, and each frame its camera, if they differ. A
@@ -53,8 +50,6 @@ def convert(
         Its selected frames are written.
     folder
         Must not exist, or be empty.
-    progress
-        Called with the number of frames written so far.
 
     Raises
     ------
@@ -64,13 +59,11 @@ def convert(
         If the folder isn't empty, or can't be written.
     """
     with staging.new_folder(folder) as temporary:
-        count, warnings = _write(recording, temporary, progress)
+        count, warnings = _write(recording, temporary)
     return Conversion(Path(folder), count, tuple(warnings))
 
 
-def _write(
-    recording: Recording, folder: Path, progress: Callable[[int], None] | None
-) -> tuple[int, list[str]]:
+def _write(recording: Recording, folder: Path) -> tuple[int, list[str]]:
     warnings: list[str] = []
     recording, correction = _uncorrected(recording)
     sample = recording.readable(_SAMPLED_FRAMES)
@@ -92,8 +85,6 @@ def _write(
             )
         writer.add(_with_channels(item, channels))
         written.append(k)
-        if progress is not None:
-            progress(len(written))
     if not written:
         raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
     _finish(recording, writer, written, correction)

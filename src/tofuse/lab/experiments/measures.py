@@ -224,10 +224,10 @@ def _walls(
     return normals, np.where(fitted, offsets, np.nan), float(np.mean(misfit**2))
 
 
-def displacement_m(a: Float64, b: Float64, depth: float = 2.0) -> Float64:
-    """(N,) displacement of a point `depth` m in front of a camera between poses a and b (N, 4, 4).
+def displacement_m(a: Float64, b: Float64) -> Float64:
+    """(N,) displacement of a point 2 m in front of a camera between poses a and b (N, 4, 4).
 
     It combines position and orientation errors in one length. NaN where a pose is NaN.
     """
-    point = np.array([0.0, 0.0, depth, 1.0])
+    point = np.array([0.0, 0.0, 2.0, 1.0])
     return np.linalg.norm(((a - b) @ point)[:, :3], axis=1)
