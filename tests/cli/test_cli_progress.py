@@ -109,7 +109,7 @@ def test_terminal_shows_stages_and_is_cleared_at_end(columns: int) -> None:
     assert any(re.match(r"  tracking .*\d+/40", line) for line in lines)
     assert any(re.match(r"\u2713 tracking ", line) for line in lines)
     assert any(line.startswith("  refining") for line in lines)
-    health = "93% inliers, 1 without a pose" if columns == 100 else "93%"
+    health = "93 % inliers, 1 without a pose" if columns == 100 else "93 %"
     time_left = r"\d+:\d+ +" if columns == 100 else ""  # left out where it is narrow
     pattern = rf"\d/40 +{time_left}{health}"
     assert any(re.search(pattern, line) for line in lines), lines

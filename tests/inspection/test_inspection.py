@@ -89,7 +89,7 @@ def test_facts_of_synthetic_frames() -> None:
     facts = inspect_recording(of(frames)).facts
     assert facts["duration"] == "1.00 s, 10.0 frames per second"
     assert facts["depth"] == "2.00 to 2.00 m, median 2.00 m"
-    assert facts["valid points"] == "50%"
+    assert facts["valid points"] == "50 %"
     assert facts["images"].startswith("40 x 30, 53 x 41 degrees")
     assert facts["kind of depth"] == "z"
     assert facts["other images"] == "none"
@@ -111,7 +111,7 @@ def test_wrong_unit_is_detected(z) -> None:
 
 def test_few_and_no_valid_points_are_detected() -> None:
     (few,) = inspect_recording(of([image(2.0, valid=60)])).warnings
-    assert few.startswith("Only 5.0% of the pixels are valid.")
+    assert few.startswith("Only 5 % of the pixels are valid.")
     found = inspect_recording(of([image(0.0)]))
     assert [f.code for f in found.findings] == ["few_valid"]
     assert repr(found).endswith(": warning few_valid")

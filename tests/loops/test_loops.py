@@ -93,9 +93,9 @@ def view(index: int) -> CloudFrame:
 @pytest.mark.parametrize(
     ("registrar", "reason"),
     [
-        (Scripted(np.eye(4), share=0.2), "only 20% of the points correspond, 30% are needed"),
+        (Scripted(np.eye(4), share=0.2), "only 20 % of the points correspond, 30 % are needed"),
         (Scripted(np.eye(4), error=0.9), "the error is 0.90 of the resolution, above 0.65"),
-        (Scripted(np.eye(4), share=0.0), "only 0% of the points correspond, 30% are needed"),
+        (Scripted(np.eye(4), share=0.0), "only 0 % of the points correspond, 30 % are needed"),
         (Scripted(pose(20.0)), "not registered: frame 9: no points correspond"),
     ],
 )

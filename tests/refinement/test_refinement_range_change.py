@@ -38,7 +38,7 @@ def test_step_of_range_is_found(right: list[SampledView], factor: float, start: 
     assert found is not None
     assert found.change == pytest.approx(factor - 1, abs=0.003)
     assert found.frame == start
-    assert found.in_words() == f"changes by {found.change:+.1%} at about frame {start}"
+    assert found.in_words() == f"changes by {100 * found.change:+.1f} % at about frame {start}"
     # What such views say about the calibration is void.
     assert not check.alarm
     assert not check.errors

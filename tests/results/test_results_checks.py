@@ -92,7 +92,7 @@ def evidence(
     ]
     graph = build_graph(posed, poses, sequence, closed)
     loops = [LoopRecord(i, j, True, "") for i, j, _ in gaps]
-    loops += [LoopRecord(i, j, False, "only 3% of the points correspond") for i, j in rejected]
+    loops += [LoopRecord(i, j, False, "only 3 % of the points correspond") for i, j in rejected]
     return Evidence(
         records,
         registrations,
@@ -508,10 +508,10 @@ def test_calibration_without_loop_confirmation_is_noted() -> None:
         return [r.text for r in judge(case)[1] if r.code == "unchecked_calibration"]
 
     (text,) = warnings_of(found)
-    assert "a focal length 5.3% larger, but no loop closure confirms it" in text
+    assert "a focal length 5.3 % larger, but no loop closure confirms it" in text
     (text,) = warnings_of(UNDETERMINED)
     assert "does not determine the camera's focal length" in text
-    assert text.endswith("allows for an error of 1%. It would move the poses by 30 mm.")
+    assert text.endswith("allows for an error of 1 %. It would move the poses by 30 mm.")
     small = Gap(2, 7, (0.006, 0.005), (0.006, 0.008))  # too small to tell
     assert warnings_of(replace(found, gap=small)) == warnings_of(found)
     gap = Gap(2, 7, (0.03, 0.02), (0.03, 0.02), 1.0, (0.03, 0.02))  # changed, not closed

@@ -69,8 +69,8 @@ def test_unknown_camera_tolerates_moderate_fits(fit):
 @pytest.mark.parametrize(
     ("fit", "words"),
     [
-        ({"outliers": 0.8}, "80% outliers, usually"),
-        ({"in_front": 0.5}, "50% free-space violations, usually"),
+        ({"outliers": 0.8}, "80 % outliers, usually"),
+        ({"in_front": 0.5}, "50 % free-space violations, usually"),
         ({"noise": 10000.0}, "noise 2500.0 times as large as usual"),
         ({"albedo": 3.0}, "albedo differences 60.0 times as large as usual"),
     ],
@@ -96,7 +96,7 @@ def test_usual_fit_is_learned_per_camera():
     third = aligned(outliers=0.3)
     assert many.assess(third).is_usual
     assert not few.assess(third).is_usual
-    assert "30% outliers, usually" in few.assess(third).reason
+    assert "30 % outliers, usually" in few.assess(third).reason
     for known in (many, few):
         assert known.assess(aligned(outliers=0.03)).is_usual
         assert not known.assess(aligned(outliers=0.85)).is_usual

@@ -84,7 +84,7 @@ def test_lost_frame_has_reason_and_next_uses_last_tracked():
     assert steps[2].T_component_camera is None
     assert steps[2].reason == "not registered to frame 1: no overlap"
     assert steps[3].T_component_camera is None
-    assert "1.9%" in steps[3].reason
+    assert "1.9 %" in steps[3].reason
     assert steps[4].reference == 1
     np.testing.assert_allclose(steps[4].T_component_camera, MOTIONS[0] @ MOTIONS[2], atol=1e-12)
 

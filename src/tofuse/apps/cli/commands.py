@@ -18,7 +18,7 @@ from rich.table import Table
 from tofuse.apps.cli import options as cli
 from tofuse.apps.cli.progress import emit, escaped, progress_for
 from tofuse.engine.errors import InputError
-from tofuse.engine.quantities import count
+from tofuse.engine.quantities import count, percent
 from tofuse.engine.results import Reason, Reconstruction
 from tofuse.engine.stopwatch import timing
 
@@ -263,7 +263,7 @@ def judge(arguments: cli.Judge) -> int:
         )
     consistencies = (("given", judgement.consistency), ("refined", judgement.refined_consistency))
     texts = [
-        f"{name} {1e3 * c.rms_m:.1f} mm rms, {c.inlier_ratio:.1%} inliers"
+        f"{name} {1e3 * c.rms_m:.1f} mm rms, {percent(c.inlier_ratio)} inliers"
         for name, c in consistencies
         if c is not None
     ]
@@ -501,7 +501,9 @@ def evaluate(arguments: cli.Evaluate) -> int:
             file=sys.stderr,
         )
     table = Table.grid(padding=(0, 2))
-    table.add_row("poses compared", f"{error.associated} ({error.coverage:.1%} of the reference)")
+    table.add_row(
+        "poses compared", f"{error.associated} ({percent(error.coverage)} of the reference)"
+    )
     table.add_row("ATE rms", f"{error.ate_rms_m:.4f} m, {data['rotation_rms_deg']:.3f} deg")
     if interval is not None:
         table.add_row("true ATE within", f"{interval[0]:.4f} to {interval[1]:.4f} m")

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column
 
 from tofuse.engine.progress import Silent
+from tofuse.engine.quantities import percent
 from tofuse.engine.results import FrameRecord
 
 _GOOD_FRACTION = 0.8  # inliers
@@ -39,7 +40,7 @@ class Health:
         }.get(
             record.status,
             (
-                "tracking" if record.inlier_share is None else f"{inliers:.0%} inliers",
+                "tracking" if record.inlier_share is None else f"{percent(inliers)} inliers",
                 "green" if inliers >= _GOOD_FRACTION else "yellow",
             ),
         )

@@ -10,6 +10,7 @@ from tofuse.apps.inspection.finding import Finding
 from tofuse.apps.inspection.planar import Distortion, fit_distortion
 from tofuse.apps.inspection.sample import Sample
 from tofuse.engine.cameras import Pinhole, RayTable
+from tofuse.engine.quantities import percent
 
 # Tolerance and maximum standard deviation of the exponent: 0, or 1 or -1 for the wrong kind.
 _KIND_TOLERANCE, _MAX_KIND_SIGMA = 0.3, 0.12
@@ -45,8 +46,9 @@ def check_kind(sample: Sample) -> Iterator[Finding]:
     )
     yield Finding(
         code,
-        f"Walls {shape}: planes fit {distortion.surfaces} surfaces to {distortion.rms_after:.2%} "
-        f"of the depth as {actual}, and to {distortion.rms_before:.2%} as {declared}.",
+        f"Walls {shape}: planes fit {distortion.surfaces} surfaces to "
+        f"{100 * distortion.rms_after:.2f} % of the depth as {actual}, and to "
+        f"{100 * distortion.rms_before:.2f} % as {declared}.",
         f'Set depth_kind to "{actual}".',
         {
             "exponent": alpha,
@@ -92,7 +94,7 @@ def check_lens(sample: Sample) -> Iterator[Finding]:
         yield Finding(
             "lens_distortion",
             f"Planes are distorted as by an uncorrected lens: rays at the corners deviate by "
-            f"{stretch:+.1%} (+-{sigma:.1%}).",
+            f"{100 * stretch:+.1f} % (+-{percent(sigma)}).",
             "Add the distortion of the lens, or its rays, to camera.json; or remove them if depth "
             "is undistorted already.",
             {"stretch": stretch, "sigma": sigma},

@@ -20,6 +20,7 @@ from tofuse.engine.cameras import Pinhole, RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.noise import family_of
+from tofuse.engine.quantities import percent
 from tofuse.formats.recordings import open_recording
 
 # Number of sampled pairs of neighbours, for `inspect` and at the start of a run.
@@ -213,5 +214,5 @@ def _depth_facts(frames: Sequence[Frame]) -> dict[str, str]:
     return {
         "depth": f"{low:.2f} to {high:.2f} m, median {median:.2f} m",
         "extent of a view": " x ".join(f"{size:.2f}" for size in extent) + " m",
-        "valid points": f"{valid_fraction(frames):.0%}",
+        "valid points": percent(valid_fraction(frames)),
     }

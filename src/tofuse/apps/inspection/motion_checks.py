@@ -8,6 +8,7 @@ import numpy as np
 
 from tofuse.apps.inspection.finding import Finding
 from tofuse.apps.inspection.sample import Pair, Sample
+from tofuse.engine.quantities import percent
 
 # Smaller motions count as standing still.
 _STILL_M, _STILL_RAD = 0.01, np.radians(0.5)
@@ -68,7 +69,7 @@ def check_motion(sample: Sample) -> Iterator[Finding]:
         yield Finding(
             "fast_motion",
             f"The camera moves fast for the frame rate: from one frame to the next the image moves "
-            f"by {shift:.0%} of its size ({angle:.1f} degrees).",
+            f"by {percent(shift)} of its size ({angle:.1f} degrees).",
             "Move more slowly, record at a higher rate, or use a smaller --every.",
             {"shift_fraction": shift, "angle_deg": angle},
         )

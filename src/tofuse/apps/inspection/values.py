@@ -12,6 +12,7 @@ from tofuse.apps.inspection.finding import Finding
 from tofuse.apps.inspection.sample import Sample
 from tofuse.engine.arrays import Bool, Float32
 from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+from tofuse.engine.quantities import percent
 from tofuse.engine.sensor import Unwrap, on_surface
 
 # Range of typical distances of ToF cameras, m.
@@ -121,7 +122,7 @@ def check_valid(sample: Sample) -> Iterator[Finding]:
     if 0 < valid < _MIN_VALID:
         yield Finding(
             "few_valid",
-            f"Only {valid:.1%} of the pixels are valid.",
+            f"Only {percent(valid)} of the pixels are valid.",
             "Move closer, use a longer exposure, or check the confidence threshold.",
             {"valid_fraction": valid},
         )
@@ -137,7 +138,7 @@ def check_saturation(sample: Sample) -> Iterator[Finding]:
     if saturated and (fraction := float(np.mean(saturated))) > _MAX_SATURATED:
         yield Finding(
             "saturated",
-            f"{fraction:.0%} of the pixels are saturated and invalid.",
+            f"{percent(fraction)} of the pixels are saturated and invalid.",
             "Use a shorter exposure, or keep farther from shiny and bright objects.",
             {"saturated_fraction": fraction},
         )
@@ -159,8 +160,8 @@ def check_flying(sample: Sample) -> Iterator[Finding]:
     if width > _MAX_EDGE_WIDTH and fraction > _MAX_FLYING:
         yield Finding(
             "flying_pixels",
-            f"{fraction:.1%} of the pixels are flying pixels between near and far surfaces: edges "
-            f"are {width:.1f} pixels wide.",
+            f"{percent(fraction)} of the pixels are flying pixels between near and far surfaces: "
+            f"edges are {width:.1f} pixels wide.",
             "Keep the filters against flying pixels on. Phones and some other cameras smooth their "
             "depth; if this one does not, clean the lens and check its focus.",
             {"flying_fraction": fraction, "edge_width_px": width},
@@ -223,8 +224,8 @@ def check_wrap(sample: Sample) -> Iterator[Finding]:
     yield Finding(
         "some_phase_wrap" if is_minority else "phase_wrap",
         f"Phase wrapping: surfaces beyond the ambiguity range ({period:.3g} m) appear too "
-        f"close: {signs.seams:.2%} of the pixels are at seams from far to near, and "
-        f"{signs.dark:.1%} are near but {1 / _DARK:.0f} times darker than the rest. {effect}",
+        f"close: {100 * signs.seams:.2f} % of the pixels are at seams from far to near, and "
+        f"{percent(signs.dark)} are near but {1 / _DARK:.0f} times darker than the rest. {effect}",
         "Use --unwrap (it needs the amplitude), record with a lower modulation frequency, or "
         "drop weak pixels by an amplitude filter.",
         {

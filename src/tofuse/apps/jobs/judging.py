@@ -49,7 +49,7 @@ from tofuse.engine.quality import (
     pose_deviation,
     trajectory_errors,
 )
-from tofuse.engine.quantities import count, length
+from tofuse.engine.quantities import count, length, percent
 from tofuse.engine.refinement import Joint, propagate_poses
 from tofuse.engine.results import Reason, Reconstruction, Verdict, accuracy_card, checks, verdicts
 from tofuse.engine.stored_views import PosedView, Spacing
@@ -734,8 +734,8 @@ def _reasons(
     before, after = map(_overlapping, compared)
     if before < _MIN_OVERLAPPING * after:
         text = (
-            f"Only {before:.0%} of the images overlap with another under these poses; under the "
-            f"refined ones {after:.0%} do."
+            f"Only {percent(before)} of the images overlap with another under these poses; under "
+            f"the refined ones {percent(after)} do."
         )
         yield Reason("images_disagree", full_range, text)
     yield from checks.cross_view_reasons(compared[0], full_range)

@@ -17,6 +17,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number, discover, name_of, registered
+from tofuse.engine.quantities import percent
 from tofuse.engine.search import pose_probability
 
 # Packages with registration methods.
@@ -105,7 +106,8 @@ def at_risk(registration: Registration, risk: float) -> Registration:
     probability = registration.probability
     if not registration.believed or probability is None or 1 - probability <= risk:
         return registration
-    reason = f"wrong with a probability of {1 - probability:.1%}, above the accepted {risk:.1%}"
+    chance = percent(1 - probability)
+    reason = f"wrong with a probability of {chance}, above the accepted {percent(risk)}"
     return replace(registration, believed=False, reason=reason)
 
 

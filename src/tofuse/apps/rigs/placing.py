@@ -23,6 +23,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import run_all
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
+from tofuse.engine.quantities import percent
 from tofuse.engine.search import (
     DISTINCT_M,
     Search,
@@ -325,7 +326,7 @@ class _Placer:
             return probability, evidence.rejection_reason()
         if chance > _MAX_CHANCE:
             return probability, (
-                f"another pose fits nearly as well, with {max(score - rival, 0.0):.1%} fewer of "
-                f"the points: the margin occurs by chance in {chance:.0%} of the cases"
+                f"another pose fits nearly as well, with {percent(max(score - rival, 0.0))} fewer "
+                f"of the points: the margin occurs by chance in {percent(chance)} of the cases"
             )
         return 1 - chance, ""

@@ -10,6 +10,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3, unit_vectors
+from tofuse.engine.quantities import percent
 
 # Minimum probability of a pose that other evidence may confirm.
 PROBABLE = 0.5
@@ -111,7 +112,7 @@ class Registration:
         return (
             f"Registration: {decision}, translation {np.linalg.norm(t):.4f} m, "
             f"rotation {np.degrees(np.linalg.norm(w)):.3f} degrees, "
-            f"{self.inlier_ratio:.0%} inliers, rms {1000 * self.rms_m:.2f} mm"
+            f"{percent(self.inlier_ratio)} inliers, rms {1000 * self.rms_m:.2f} mm"
         )
 
     @property
@@ -184,7 +185,7 @@ class Registration:
         """How the pose was estimated, in words."""
         if self.margin is None:
             return "followed from a guess"
-        return f"found by a search, margin {max(self.margin, 0.0):.0%}"
+        return f"found by a search, margin {percent(max(self.margin, 0.0))}"
 
     def between(self, T_a_target: Float64, T_source_b: Float64) -> Registration:
         """Return the registration of source b in target a, given two rigid transforms (4, 4).

@@ -23,6 +23,7 @@ from tofuse.engine.compute import one_blas_thread, run_all
 from tofuse.engine.geometry import se3, unit_vectors
 from tofuse.engine.loops.join_checks import JoinChecks
 from tofuse.engine.loops.merged_components import DRIFT, MergedComponents, TrackedComponent, View
+from tofuse.engine.quantities import percent
 from tofuse.engine.search import (
     DISTINCT_M,
     Search,
@@ -448,7 +449,7 @@ class Locator:
         if probability < pose_probability.ACCEPTED:
             reasons.append("no pose in the map is probable enough")
         if placed.contradiction > self._max_contradiction:
-            reasons.append(f"{placed.contradiction:.0%} of the overlap contradicts the map")
+            reasons.append(f"{percent(placed.contradiction)} of the overlap contradicts the map")
         directions = placed.aligned.unobservable * projective.UNITS
         alignment = _ALIGNMENT
         if len(directions):

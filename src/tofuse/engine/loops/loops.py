@@ -17,6 +17,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.graph import LoopRecord
 from tofuse.engine.icp import algorithm_1
 from tofuse.engine.parts import check_number
+from tofuse.engine.quantities import percent
 from tofuse.engine.search import SearchOptions
 from tofuse.engine.stored_views import ViewStore
 from tofuse.engine.views import PreparedView
@@ -233,8 +234,8 @@ class Confirmation(Bounded):
             return registration.reason
         if registration.correspondences == 0 or registration.inlier_ratio < self.min_fraction:
             return (
-                f"only {registration.inlier_ratio:.0%} of the points correspond, "
-                f"{self.min_fraction:.0%} are needed"
+                f"only {percent(registration.inlier_ratio)} of the points correspond, "
+                f"{percent(self.min_fraction)} are needed"
             )
         error = mean_error(registration)
         if not error <= self.max_error:
@@ -274,7 +275,7 @@ class Confirmation(Bounded):
         )
         rejection_reason = self.rejection_reason(best)
         reason = rejection_reason or (
-            f"{best.inlier_ratio:.0%} of the points correspond, with an error of "
+            f"{percent(best.inlier_ratio)} of the points correspond, with an error of "
             f"{mean_error(best):.2f} of the resolution"
         )
         record = LoopRecord(

@@ -28,6 +28,7 @@ from tofuse.engine.loops.loops import (
     in_order,
 )
 from tofuse.engine.parts import part
+from tofuse.engine.quantities import percent
 from tofuse.engine.search import (
     DISTINCT_M,
     SearchOptions,
@@ -323,7 +324,7 @@ class _RevisitLoops(Loops):
         if registration is None:
             return ClosedLoop(LoopRecord(*pair, False, _REJECTED))
         reason = self._rejection_reason(registration)
-        explanation = reason or f"right with a probability of {registration.probability:.0%}"
+        explanation = reason or f"right with a probability of {percent(registration.probability)}"
         record = LoopRecord.of(pair, not reason, explanation, registration)
         return ClosedLoop.of(record, registration)
 
@@ -397,7 +398,7 @@ class _RevisitLoops(Loops):
 
     def _rejection_reason(self, registration: Registration) -> str:
         if registration.overlap is not None and registration.overlap < _MIN_OVERLAP:
-            return f"only {registration.overlap:.0%} of the points project into the other view"
+            return f"only {percent(registration.overlap)} of the points project into the other view"
         if len(registration.unobservable) > _MAX_DEGENERATE:
             return f"{len(registration.unobservable)} directions are degenerate"
         return "" if registration.believed else registration.reason

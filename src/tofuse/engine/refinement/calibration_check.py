@@ -22,6 +22,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
+from tofuse.engine.quantities import percent
 from tofuse.engine.refinement.camera_response import SIGNIFICANT, Linearised, significance_of
 from tofuse.engine.refinement.joint_alignment import (
     AlignedViews,
@@ -468,7 +469,7 @@ def in_words(errors: Mapping[str, float]) -> list[str]:
     if "focal" in errors:
         change = 1 / (1 + errors["focal"]) - 1
         more = "larger" if change > 0 else "smaller"
-        words.append(f"a focal length {abs(change):.1%} {more}")
+        words.append(f"a focal length {percent(abs(change))} {more}")
     if "offset" in errors:
         more = "longer" if errors["offset"] > 0 else "shorter"
         words.append(f"ranges {abs(errors['offset']) * 1e3:.0f} mm {more}")
@@ -477,11 +478,12 @@ def in_words(errors: Mapping[str, float]) -> list[str]:
             # A larger ray coordinate of a pixel is a principal point further left or up.
             where = less if errors[name] > 0 else more
             words.append(
-                f"a principal point {abs(errors[name]):.1%} of the focal length further {where}"
+                f"a principal point {percent(abs(errors[name]))} of the focal length further "
+                f"{where}"
             )
     if "distortion" in errors:
         kind = "barrel" if errors["distortion"] > 0 else "pincushion"
-        words.append(f"{abs(errors['distortion']):.1%} more {kind} distortion at 45 degrees")
+        words.append(f"{percent(abs(errors['distortion']))} more {kind} distortion at 45 degrees")
     return words
 
 

@@ -72,8 +72,8 @@ class RangeChange:
     def in_words(self) -> str:
         """Describe the change."""
         if self.frame is None:
-            return f"drifts by {self.change:+.1%} over the recording"
-        return f"changes by {self.change:+.1%} at about frame {self.frame}"
+            return f"drifts by {100 * self.change:+.1f} % over the recording"
+        return f"changes by {100 * self.change:+.1f} % at about frame {self.frame}"
 
 
 @dataclass(frozen=True, eq=False)

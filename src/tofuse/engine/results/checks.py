@@ -600,7 +600,7 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
     if check.undetermined:
         text = (
             "The recording does not determine the camera's focal length: the stated accuracy "
-            "allows for an error of 1%."
+            "allows for an error of 1 %."
         )
         motion = length(0.01 * check.motion["focal"][0])
         if motion != length(0.0):  # else the views give no estimate

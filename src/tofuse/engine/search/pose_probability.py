@@ -15,6 +15,7 @@ import numpy as np
 
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
+from tofuse.engine.quantities import percent
 from tofuse.engine.search.pair_agreement import Agreement
 
 # Tolerances of a right pose: fraction of the depth, and rad.
@@ -156,8 +157,8 @@ class PoseEvidence:
         if self.probability >= ACCEPTED:
             return ""
         return "; ".join(self.problems) or (
-            f"the probability that the pose is right is {self.probability:.0%}, below "
-            f"{ACCEPTED:.0%}"
+            f"the probability that the pose is right is {percent(self.probability)}, below "
+            f"{percent(ACCEPTED)}"
         )
 
     @property
@@ -165,16 +166,18 @@ class PoseEvidence:
         """What is unusual of a right pose, in words."""
         problems = []
         if self.support < _MIN_SUPPORT:
-            problems.append(f"only {self.support:.0%} of the points of both views support the pose")
+            problems.append(
+                f"only {percent(self.support)} of the points of both views support the pose"
+            )
         if self.margin is not None and self.margin < MIN_LEAD:
             comparison = "as well or better"
             if self.margin > 0:
                 comparison = (
-                    f"nearly as well, with a score lower by {self.margin:.1%} of the points"
+                    f"nearly as well, with a score lower by {percent(self.margin)} of the points"
                 )
             problems.append(f"another pose fits {comparison}")
         if self.contradiction > CONTRADICTION:
-            problems.append(f"{self.contradiction:.0%} of the overlap contradicts the pose")
+            problems.append(f"{percent(self.contradiction)} of the overlap contradicts the pose")
         if self.degenerate:
             plural = "direction is" if self.degenerate == 1 else "directions are"
             problems.append(f"{self.degenerate} {plural} degenerate")

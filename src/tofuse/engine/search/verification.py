@@ -17,6 +17,7 @@ import numpy as np
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Float64
 from tofuse.engine.normal import robust_sigma
+from tofuse.engine.quantities import percent
 from tofuse.engine.search.pair_agreement import AgreementOptions
 
 # Statistics of an alignment, all logarithms: odds of an outlier, odds of a point in free space, the
@@ -174,7 +175,7 @@ def _describe(index: int, value: float, usual: float) -> str:
         floor = _ODDS_FLOOR[index]
         odds = np.exp([value, usual])
         fractions = np.clip((odds * (1 + floor) - floor) / (1 + odds), 0, 1)
-        return f"{fractions[0]:.0%} {_NAMES[index]}, usually {fractions[1]:.0%}"
+        return f"{percent(fractions[0])} {_NAMES[index]}, usually {percent(fractions[1])}"
     return f"{_NAMES[index]} {np.exp(value - usual):.1f} times as large as usual"
 
 

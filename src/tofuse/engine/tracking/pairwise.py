@@ -21,6 +21,7 @@ from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp import algorithm_1, extent
 from tofuse.engine.parts import part
+from tofuse.engine.quantities import percent
 from tofuse.engine.search import SearchOptions, pose_probability
 from tofuse.engine.tracking.base import Guess, Odometry, Step, Tracker
 from tofuse.engine.tracking.motion import FrameTime, MotionModel
@@ -116,8 +117,8 @@ class _SequentialTracker(Tracker):
             return _lost(f"not registered to frame {last.frame.index}: {error}", last)
         if registration.inlier_ratio < options.min_inlier_ratio:
             return _lost(
-                f"only {registration.inlier_ratio:.1%} of the points correspond to frame "
-                f"{last.frame.index}, {options.min_inlier_ratio:.1%} are needed",
+                f"only {percent(registration.inlier_ratio)} of the points correspond to frame "
+                f"{last.frame.index}, {percent(options.min_inlier_ratio)} are needed",
                 last,
             )
         self._motion = registration.T_target_source
