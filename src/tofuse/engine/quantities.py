@@ -24,12 +24,12 @@ def percent(fraction: float | None) -> str:
     return f"{round(percents, int(percents < 10 or percents > 99)):g} %"
 
 
-def probability(value: float) -> str:
+def probability(value: float | None) -> str:
     """Return a probability as text, no closer to 0 and 1 than can be justified: "over 99.9 %"."""
-    if value >= MAX_PROBABILITY:
-        return f"over {percent(MAX_PROBABILITY)}"
     limit = 1 - MAX_PROBABILITY
-    return f"below {percent(limit)}" if value < limit else percent(value)
+    if value is None or limit <= value < MAX_PROBABILITY:
+        return percent(value)
+    return f"below {percent(limit)}" if value < limit else f"over {percent(MAX_PROBABILITY)}"
 
 
 def count(number: int, noun: str) -> str:

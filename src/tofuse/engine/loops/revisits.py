@@ -28,7 +28,7 @@ from tofuse.engine.loops.loops import (
     in_order,
 )
 from tofuse.engine.parts import part
-from tofuse.engine.quantities import percent
+from tofuse.engine.quantities import percent, probability
 from tofuse.engine.search import (
     DISTINCT_M,
     SearchOptions,
@@ -324,7 +324,9 @@ class _RevisitLoops(Loops):
         if registration is None:
             return ClosedLoop(LoopRecord(*pair, False, _REJECTED))
         reason = self._rejection_reason(registration)
-        explanation = reason or f"right with a probability of {percent(registration.probability)}"
+        explanation = (
+            reason or f"right with a probability of {probability(registration.probability)}"
+        )
         record = LoopRecord.of(pair, not reason, explanation, registration)
         return ClosedLoop.of(record, registration)
 

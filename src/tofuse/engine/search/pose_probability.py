@@ -15,7 +15,7 @@ import numpy as np
 
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Float64
-from tofuse.engine.quantities import percent
+from tofuse.engine.quantities import percent, probability
 from tofuse.engine.search.pair_agreement import Agreement
 
 # Tolerances of a right pose: fraction of the depth, and rad.
@@ -157,7 +157,7 @@ class PoseEvidence:
         if self.probability >= ACCEPTED:
             return ""
         return "; ".join(self.problems) or (
-            f"the probability that the pose is right is {percent(self.probability)}, below "
+            f"the probability that the pose is right is {probability(self.probability)}, below "
             f"{percent(ACCEPTED)}"
         )
 
