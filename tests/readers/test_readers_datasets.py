@@ -300,10 +300,32 @@ def test_colour_of_camera_in_given_camera_json(tmp_path: Path) -> None:
 def test_redwood_with_fewer_colour_images_of_other_names(tmp_path: Path) -> None:
     make_redwood(tmp_path)
     (tmp_path / "color" / "000001.png").unlink()
-    for path in (tmp_path / "color").iterdir():
-        path.rename(path.with_name(f"photo {path.name}"))
+    for path, name in zip((tmp_path / "color").iterdir(), "ab", strict=True):
+        path.rename(path.with_name(f"photo {name}.png"))
     recording = open_recording(tmp_path, format="redwood")
     assert any("their names don't show which belong together" in w for w in recording.warnings)
+
+
+@pytest.mark.parametrize("names", ["{1:06d}.png", "{0}_{1:04d}.png"])
+def test_redwood_with_other_images_missing_of_each_kind(tmp_path: Path, names: str) -> None:
+    """As many images of each kind, but not of the same frames."""
+    image = np.zeros((480, 640, 3), np.uint8)
+    for name, frames in (("depth", (0, 1, 3, 4)), ("color", (0, 1, 2, 4))):
+        (tmp_path / name).mkdir()
+        for k in frames:
+            file = tmp_path / name / names.format(name, k)
+            write_png(file, COUNTS[0] if name == "depth" else image + 40 * k)
+    recording = open_recording(tmp_path, format="redwood")
+    assert any("only 3 of 4 frames have colour" in w for w in recording.warnings)
+    colors = [None if f.color_image is None else f.color_image[0, 0, 0] for f in recording]
+    assert colors == [0, 40, None, 160]
+    # Counted from another number.
+    for k, path in enumerate(sorted((tmp_path / "depth").iterdir())):
+        path.rename(path.with_name(f"{k:06d}.png"))
+    for k, path in enumerate(sorted((tmp_path / "color").iterdir())):
+        path.rename(path.with_name(f"{k + 10:06d}.png"))
+    colors = [f.color_image[0, 0, 0] for f in open_recording(tmp_path, format="redwood")]
+    assert colors == [0, 40, 80, 160]
 
 
 def test_redwood_without_camera_is_ambiguous(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ PRIMESENSE = Pinhole(*SIZE, 525.0, 525.0, 319.5, 239.5)
 _COLOR_FOLDERS = ("color", "image", "rgb")
 COLOR_LIMIT_S = 0.05
 _MICROSECONDS = re.compile(r"[0-9]+-([0-9]{12})")
+_NUMBER = re.compile(r"[^0-9]*([0-9]{1,18})(?:-[0-9]+)?")
 
 
 @part("reader", "redwood", label="validated")
@@ -155,12 +156,14 @@ def color_files(
     if times is not None and color_times is not None:
         nearest = associate(times, color_times, limit=COLOR_LIMIT_S, exclusive=False)
         matches = [color[k] if k >= 0 else None for k in nearest]
-    elif len(color) == len(files):
-        return list(color)
     else:
         named = {file.stem: file for file in color}
         numbered = {_number(file): file for file in color if _number(file) is not None}
         matches = [named.get(f.stem) or numbered.get(_number(f)) for f in files]
+        # Of as many images of another first number, or of names that tell nothing.
+        alike = len(color) == len(files)
+        if alike and (_numbered_alike(color, files) or matches.count(None) > len(files) // 2):
+            return list(color)
     if any(matches):
         return matches
     warnings.append(
@@ -176,9 +179,15 @@ def color_images(folder: Path) -> list[Path]:
 
 
 def _number(path: Path) -> int | None:
-    """Number of an image: the prefix of its name."""
-    first = path.stem.split("-")[0]
-    return int(first) if first.isdecimal() and len(first) <= 18 else None
+    """Number of an image: of names like 000012-000000400428 or color_000012."""
+    match = _NUMBER.fullmatch(path.stem)
+    return int(match.group(1)) if match else None
+
+
+def _numbered_alike(color: list[Path], files: list[Path]) -> bool:
+    """Whether the numbers of colour images are those of as many depth images, plus a constant."""
+    pairs = [(_number(c), _number(f)) for c, f in zip(color, files, strict=True)]
+    return len({c - f for c, f in pairs if c is not None and f is not None}) == 1
 
 
 def _poses(path: Path, count: int) -> Float64:
