@@ -59,6 +59,10 @@ def test_folder_with_single_recording_stands_for_it(tmp_path: Path) -> None:
     (tmp_path / "Küche 1" / "notes.txt").write_text("")
     recording = open_recording(tmp_path / "Küche 1")
     assert (recording.format, len(recording)) == ("3dscannerapp", 3)
+    (tmp_path / "one" / "in").mkdir(parents=True)
+    (tmp_path / "Küche 1").rename(tmp_path / "one" / "in" / "another")
+    assert len(open_recording(tmp_path / "one")) == 3
+    (tmp_path / "one" / "in" / "another").rename(tmp_path / "Küche 1")
     make_scanner_app(tmp_path / "Küche 1" / "2026_11_29")
     with pytest.raises(InputError, match="several recordings: 2026_11_28"):
         open_recording(tmp_path / "Küche 1")

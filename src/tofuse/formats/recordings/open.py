@@ -75,7 +75,7 @@ def open_recording(
         Files, folders or .zip files of these; several are joined in the order given. A folder of
         native or SR4000 recordings is joined in name order; if it contains a rig.json, its
         recordings are the cameras of a rig, one image of each in turn. A folder with a single
-        recording in it stands for that.
+        recording or folder in it stands for that.
     format
         Name of a reader, instead of detection.
     camera
@@ -205,6 +205,8 @@ def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
         )
     if not sniffs and (parts := _recordings_in(path)):
         return parts
+    if not sniffs and len(children) == 1 and reading.is_folder(children[0]):
+        return _resolve(children[0], format)
     suffixes = {p.suffix.lower() for p in (children or [path]) if p.is_file()}
     if suffixes and suffixes <= _ARCHIVES:
         raise InputError(
