@@ -199,6 +199,21 @@ def test_infrared_of_same_pixels_is_the_amplitude(tmp_path: Path) -> None:
         np.testing.assert_array_equal(frame.amplitude_image, expected)
 
 
+def test_driver_restarted_during_recording(tmp_path: Path) -> None:
+    """A ROS 1 bag has one connection per publisher of a topic."""
+    bag = Bag(tmp_path, "ros1")
+    bag.info("/camera/depth/camera_info")
+    bag.image(TOPIC, 10.0, COUNTS[0], "16UC1")
+    bag.image(TOPIC, 10.1, COUNTS[1], "16UC1")
+    bag.connections[TOPIC] = bag.writer.add_connection(
+        TOPIC, "sensor_msgs/msg/Image", typestore=bag.store, callerid="/restarted"
+    )
+    bag.image(TOPIC, 10.2, COUNTS[2], "16UC1")
+    recording = open_recording(bag.close())
+    np.testing.assert_allclose([f.z for f in recording], COUNTS / 1000, rtol=1e-6)
+    np.testing.assert_allclose(recording[1].z, COUNTS[1] / 1000, rtol=1e-6)
+
+
 def test_topic_can_be_chosen(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "mcap")
     bag.info("/a/depth/camera_info")
@@ -424,6 +439,20 @@ def test_colour_of_separate_camera(tmp_path: Path, kind: str, compressed: bool) 
         np.testing.assert_array_equal(frame.color_image[seen][:, 0], 8 * uv[:, 0])
         np.testing.assert_array_equal(frame.color_image[seen][:, 1], 10 * uv[:, 1])
         assert (frame.color_image[seen][:, 2] == 50 + k).all()
+
+
+def test_static_transforms_of_early_publishers(tmp_path: Path) -> None:
+    """They repeat them on /tf, which makes neither poses nor a camera that moves."""
+    bag = Bag(tmp_path, "ros1")
+    depth_bag(bag)
+    bag.info("/camera/color/camera_info", D=(), lens=RGB_LENS)
+    for time in (9.0, 9.1, 10.1):
+        bag.tf("/tf", time, "rig", "depth", T_RIG_DEPTH)
+        bag.tf("/tf", time, "rig", "color", T_RIG_COLOR)
+    bag.image(COLOR_TOPIC, 10.0, color_at(0), "rgb8", frame="color", width=32)
+    recording = open_recording(bag.close())
+    assert recording.reference is None
+    assert recording[0].color_image is not None
 
 
 def test_colour_registered_to_depth(tmp_path: Path) -> None:

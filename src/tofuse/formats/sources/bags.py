@@ -115,13 +115,16 @@ class Track:
     Attributes
     ----------
     connection
-        The connection of rosbags, with ``topic`` and ``msgtype``.
+        A connection of rosbags, with ``topic`` and ``msgtype``. A topic has another one for each
+        publisher, such as for a driver that was restarted.
     times
         (N,) s, from the message headers, or else of their arrival.
     """
 
     def __init__(self, bag: Any, connection: Any) -> None:
         self.bag, self.connection = bag, connection
+        kind = (connection.topic, connection.msgtype)
+        self._connections = [c for c in bag.connections if (c.topic, c.msgtype) == kind]
         times_of_messages = [
             (t, header_time(raw, getattr(bag, "is2", False))) for _, t, raw in self._messages()
         ]
@@ -166,7 +169,7 @@ class Track:
 
     def _messages(self, start: int | None = None) -> Iterator[tuple[Any, int, Any]]:
         messages: Iterator[tuple[Any, int, Any]] = self.bag.messages(
-            connections=[self.connection], start=start
+            connections=self._connections, start=start
         )
         return messages
 
@@ -491,7 +494,8 @@ _MAX_DEPTH = 64
 class _Edge:
     """The pose of a frame in its parent: T_parent_child (N, 4, 4) at ascending times (N,).
 
-    If `static`, the last one applies at all times.
+    If `static`, the last one applies at all times. Early publishers of static transforms repeat
+    them on /tf.
     """
 
     parent: str
@@ -612,4 +616,5 @@ def _edge(rows: Sequence[tuple[float, str, Float64]], static: bool) -> _Edge:
     times = np.array([row[0] for row in rows])
     T = np.array([row[2] for row in rows])
     is_last = np.append(np.diff(times) > 0, True)
+    static |= len(T) > 1 and bool((T[0] == T).all())
     return _Edge(parent, times[is_last], T[is_last], static)
