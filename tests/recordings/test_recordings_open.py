@@ -162,6 +162,8 @@ def test_paths_that_are_no_recordings(tmp_path: Path) -> None:
             open_recording(tmp_path / name)
     with pytest.raises(InputError, match="no recording was given"):
         open_recording()
+    with pytest.raises(InputError, match="is '', not a path"):
+        open_recording("")
     with pytest.raises(InputError, match="no format 'mp3'"):
         open_recording(tmp_path / "file", format="mp3")
 

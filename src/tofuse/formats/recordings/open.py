@@ -423,7 +423,8 @@ class Opening(OpeningOptions):
         Fields without an option keep their defaults.
         """
         names = [f.name for f in fields(cls) if hasattr(options, f.name)]
-        return cls(tuple(map(Path, inputs)), **{name: getattr(options, name) for name in names})
+        paths = tuple(reading.path_of(path, "path", "pass a recording") for path in inputs)
+        return cls(paths, **{name: getattr(options, name) for name in names})
 
     @property
     def source(self) -> tuple[object, ...]:
