@@ -171,9 +171,10 @@ def test_organised_clouds_become_images(tmp_path: Path) -> None:
     z[:, 2, 3] = np.nan
     v, u = np.mgrid[:12, :16].astype(np.float32)
     light = RNG.uniform(size=(4, 192)).astype(np.float32)
+    color = RNG.integers(0, 256, (192, 3)).astype(np.uint8)
     for k in range(4):
         points = np.stack([(u - 7.5) / 20 * z[k], (v - 5.5) / 21 * z[k], z[k]], -1)
-        bag.cloud("/tof/points", 10 + k, points.reshape(-1, 3), light[k], height=12)
+        bag.cloud("/tof/points", 10 + k, points.reshape(-1, 3), light[k], 12, color=color, pad=k)
     recording = open_recording(bag.close())
     for k in (0, 3):
         frame = recording[k]
@@ -181,6 +182,7 @@ def test_organised_clouds_become_images(tmp_path: Path) -> None:
         assert frame.valid.sum() == 191
         np.testing.assert_allclose(frame.camera.rays()[4, 9], (1.5 / 20, -1.5 / 21), atol=1e-5)
         np.testing.assert_array_equal(frame.amplitude_image, light[k].reshape(12, 16))
+        np.testing.assert_array_equal(frame.color_image, color.reshape(12, 16, 3))
 
 
 def test_infrared_of_same_pixels_is_the_amplitude(tmp_path: Path) -> None:

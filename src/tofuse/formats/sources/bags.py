@@ -22,6 +22,7 @@ from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import quaternion, se3
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
+from tofuse.formats.geometry import unpacked_color
 from tofuse.formats.images import as_color, parse_image
 from tofuse.formats.sources.file_source import FileSource
 from tofuse.formats.sources.pixels import finite_float32, sampled_color
@@ -447,7 +448,7 @@ def lens(message: Any, where: str, *, rectified: bool = False) -> Pinhole:
 
 
 def cloud(message: Any, where: str) -> GeometryRecord:
-    """Read points and amplitude of a PointCloud2.
+    """Read points, amplitude and colour of a PointCloud2.
 
     Raises
     ------
@@ -459,11 +460,14 @@ def cloud(message: Any, where: str) -> GeometryRecord:
     missing = [name for name in "xyz" if name not in fields]
     if missing:
         raise InputError(f"has no field {missing[0]!r}", where=where, remedy="record x, y and z")
-    count, step = int(message.width) * int(message.height), int(message.point_step)
-    data = np.frombuffer(message.data, np.uint8)
-    if step < 1 or count * step > len(data):
+    width, height, step = int(message.width), int(message.height), int(message.point_step)
+    data, row = np.frombuffer(message.data, np.uint8), width * step
+    if step < 1 or height * row > len(data):
         raise InputError("is cut off", where=where, remedy="check the bag")
-    rows = data[: count * step].reshape(count, step)
+    # Rows may be padded; not all drivers state their length.
+    stated = int(message.row_step)
+    stride = stated if row < stated <= len(data) // max(height, 1) else row
+    rows = data[: height * stride].reshape(height, stride)[:, :row].reshape(-1, step)
 
     def column(name: str) -> NDArray[Any]:
         field = fields[name]
@@ -479,7 +483,8 @@ def cloud(message: Any, where: str) -> GeometryRecord:
         points = np.stack(xyz, 1).astype(np.result_type(np.float32, *(c.dtype for c in xyz)))
     amplitude = next((name for name in _AMPLITUDES if name in fields), None)
     scalars = {} if amplitude is None else {"amplitude": column(amplitude)}
-    return GeometryRecord(points, scalars=scalars)
+    color = unpacked_color({name: column(name) for name in ("rgb", "rgba") if name in fields})
+    return GeometryRecord(points, color=color, scalars=scalars)
 
 
 _ROS2_TYPE = "tf2_msgs/msg/TFMessage"
