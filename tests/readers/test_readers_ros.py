@@ -19,6 +19,7 @@ from ros_bags import (
     COLOR_V,
     COLORS,
     COUNTS,
+    DEPTH_LENS,
     RNG,
     STEP,
     T_COLOR,
@@ -83,6 +84,23 @@ def test_lens_of_rectified_images(tmp_path: Path, topic: str, rectified: bool) -
     camera = open_recording(bag.close())[0].camera
     raw = BrownConrady(16, 12, 20.0, 21.0, 7.5, 5.5, k1=0.1, k2=0.02)
     assert camera == (Pinhole(16, 12, 18.0, 19.0, 7.25, 5.25) if rectified else raw)
+
+
+@pytest.mark.parametrize(
+    ("topic", "own", "other"),
+    [
+        ("/camera/depth/image_raw", "/camera/depth/camera_info", "/camera/camera_info"),
+        ("/depth_image", "/depth_camera_info", "/color_camera_info"),
+    ],
+)
+def test_lens_is_that_of_the_topic_of_like_name(
+    tmp_path: Path, topic: str, own: str, other: str
+) -> None:
+    bag = Bag(tmp_path, "mcap")
+    bag.info(other, D=(), lens=Pinhole(16, 12, 30.0, 30.0, 8.0, 6.0))
+    bag.info(own, D=())
+    bag.image(topic, 10.0, COUNTS[0], "16UC1")
+    assert open_recording(bag.close())[0].camera == DEPTH_LENS
 
 
 def test_depth_of_depthai(tmp_path: Path) -> None:

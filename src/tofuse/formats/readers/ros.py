@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from contextlib import suppress
+from os.path import commonprefix
 from pathlib import Path
 from typing import Any
 
@@ -168,13 +169,18 @@ class RosSource(bags.BagSource):
         self.camera = self._lens_of(candidates[0], self.connection)
 
     def _camera_infos(self, connection: Any) -> list[Any]:
-        """The CameraInfo connections in the namespace of an image connection."""
+        """The CameraInfo connections in the namespace of an image connection, of like names first.
+
+        As in /camera/depth and /camera, or /depth_image, /color_camera_info, /depth_camera_info.
+        """
         folder = connection.topic.rsplit("/", 1)[0]
-        return [
+        found = [
             c
             for c in self.bag.connections
             if c.msgtype == INFO and c.topic.rsplit("/", 1)[0] in (folder, folder.rsplit("/", 1)[0])
         ]
+        alike = {c.topic: len(commonprefix((c.topic, connection.topic))) for c in found}  # noqa: RUF071
+        return sorted(found, key=lambda c: -alike[c.topic])
 
     def _transforms(self) -> bags.Transforms:
         try:
