@@ -234,6 +234,24 @@ def test_driver_restarted_during_recording(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording[1].z, COUNTS[1] / 1000, rtol=1e-6)
 
 
+def test_amplitude_and_colour_are_of_the_same_camera(tmp_path: Path) -> None:
+    """Of several equal cameras of a robot."""
+    bag = Bag(tmp_path, "mcap")
+    for k, name in enumerate(("front", "rear")):
+        bag.info(f"/{name}/depth/camera_info", D=())
+        bag.image(f"/{name}/depth/image_raw", 10, COUNTS[k], "16UC1", frame=name)
+        bag.image(f"/{name}/ir/image_raw", 10, COUNTS[k], "mono16", frame=name)
+        color = np.full((12, 16, 3), 50 + k, np.uint8)
+        bag.image(f"/{name}/color/image_raw", 10, color, "rgb8", frame=name, width=16)
+        bag.info(f"/{name}/color/camera_info", D=())
+        bag.tf("/tf_static", 9.0, "base", name, np.eye(4))
+    path = bag.close()
+    for k, name in enumerate(("front", "rear")):
+        frame = open_recording(path, topic=f"/{name}/depth/image_raw")[0]
+        np.testing.assert_array_equal(frame.amplitude_image, COUNTS[k])
+        assert frame.color_image.max() == 50 + k
+
+
 def test_topic_can_be_chosen(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "mcap")
     bag.info("/a/depth/camera_info")

@@ -156,6 +156,7 @@ class RosSource(bags.BagSource):
             self.color_camera = None  # the bag's own is found below
             return
         infos = [c for c in self.bag.connections if c.msgtype == INFO]
+        infos = _alike_first(infos, self.connection)
         adjacent = self._camera_infos(self.connection)
         candidates = (
             adjacent or [c for c in infos if "depth" in c.topic] or infos[: len(infos) == 1]
@@ -179,8 +180,7 @@ class RosSource(bags.BagSource):
             for c in self.bag.connections
             if c.msgtype == INFO and c.topic.rsplit("/", 1)[0] in (folder, folder.rsplit("/", 1)[0])
         ]
-        alike = {c.topic: len(commonprefix((c.topic, connection.topic))) for c in found}  # noqa: RUF071
-        return sorted(found, key=lambda c: -alike[c.topic])
+        return _alike_first(found, connection)
 
     def _transforms(self) -> bags.Transforms:
         try:
@@ -218,7 +218,8 @@ class RosSource(bags.BagSource):
     def _find_color(self, transforms: bags.Transforms) -> None:
         """Find a colour camera with known intrinsics and pose relative to depth."""
         missing: list[str] = []
-        for connection in sorted(self.bag.connections, key=lambda c: (c.msgtype, c.topic)):
+        connections = sorted(self.bag.connections, key=lambda c: (c.msgtype, c.topic))
+        for connection in _alike_first(connections, self.connection):
             if not self._is_color(connection) or not len(track := bags.Track(self.bag, connection)):
                 continue
             try:
@@ -274,7 +275,8 @@ class RosSource(bags.BagSource):
 
     def _find_amplitude(self) -> bags.Track | None:
         """The amplitude track of the same sensor: its images match the depth's size and times."""
-        for connection in sorted(self.bag.connections, key=lambda c: c.topic):
+        connections = sorted(self.bag.connections, key=lambda c: c.topic)
+        for connection in _alike_first(connections, self.connection):
             is_named = any(keyword in connection.topic.lower() for keyword in _AMPLITUDE_KEYWORDS)
             if connection.msgtype != IMAGE or connection.topic == self.connection.topic:
                 continue
@@ -304,6 +306,11 @@ class RosSource(bags.BagSource):
                     return None
                 images.append(points.reshape(message.height, message.width, 3))
         return organised.common_camera(images)
+
+
+def _alike_first(connections: list[Any], other: Any) -> list[Any]:
+    """Connections sorted by how much of its name their topic begins with: those of one camera."""
+    return sorted(connections, key=lambda c: -len(commonprefix((c.topic, other.topic))))  # noqa: RUF071
 
 
 def _rank(connection: Any) -> int | None:
