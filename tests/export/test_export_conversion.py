@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,20 @@ def test_every_camera(tmp_path: Path, name: str) -> None:
     rounded = 1e-6 if "depth_unit_m" in before.metadata else 0.51e-4
     check_same(before, open_recording(tmp_path / "out"), depth=rounded)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "scan"]
+
+
+def test_depth_stored_as_floats(tmp_path: Path) -> None:
+    """A unit of 1 m, as of float arrays, is no count to which depth is rounded."""
+    folder = tmp_path / "native"
+    make_native(folder)
+    about = json.loads((folder / "camera.json").read_text()) | {"depth_unit_m": 1.0}
+    (folder / "camera.json").write_text(json.dumps(about))
+    for k, path in enumerate(sorted((folder / "depth").iterdir())):
+        depth = np.linspace(1, 2 + k, about["height"] * about["width"], dtype=np.float32)
+        np.save(path.with_suffix(".npy"), depth.reshape(about["height"], about["width"]))
+        path.unlink()
+    before = open_recording(folder)
+    check_same(before, open_recording(convert(before, tmp_path / "out").folder), depth=6e-5)
 
 
 def test_rays_of_each_frame(tmp_path: Path) -> None:

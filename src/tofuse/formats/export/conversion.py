@@ -27,6 +27,7 @@ from tofuse.formats.recordings import RecordingWriter
 FINEST_UNIT_M = 1e-4
 MIN_SIGMA_UNIT_M = 1e-5
 _SAMPLED_FRAMES = 24
+_MAX_FRACTION = 0.05  # of a count, by the precision of float32
 _CHANNELS = ("amplitude_image", "confidence_image", "color_image")
 
 
@@ -44,8 +45,8 @@ def convert(
 ) -> Conversion:
     """Write a recording as a native folder.
 
-    Depth keeps its unit, if the recording has one, and each frame its camera, if they differ. A
-    correction is stored with uncorrected depth. The folder appears when all is written.
+    Depth keeps its unit, if it is in whole counts of one, and each frame its camera, if they
+    differ. A correction is stored with uncorrected depth. The folder appears when all is written.
 
     Parameters
     ----------
@@ -140,7 +141,7 @@ def _writer(
     if sigma_unit is None and sigmas:
         sigma_unit = max(MIN_SIGMA_UNIT_M, _round_up(max(sigmas) / depth_counts.MAX_COUNTS))
     unit = metadata.get("depth_unit_m")
-    if unit is None:
+    if unit is None or not all(_is_counted(f, unit) for f in images):
         farthest = max(float(f.depth.max()) for f in images)
         unit = max(FINEST_UNIT_M, _round_up(1.25 * farthest / depth_counts.MAX_COUNTS))
     if any(f.amplitude_image is not None for f in images):
@@ -156,6 +157,12 @@ def _writer(
         camera_per_frame=camera_per_frame,
         **properties,
     )
+
+
+def _is_counted(frame: RangeFrame, unit_m: float) -> bool:
+    """Whether depth is stored in counts of a unit: not as floats in it, such as metres."""
+    counts = frame.depth[frame.valid] / unit_m
+    return bool((np.abs(counts - np.rint(counts)) < _MAX_FRACTION).all())
 
 
 def _round_up(value: float) -> float:
