@@ -18,7 +18,7 @@ from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.engine.frames.recording import Recording
+from tofuse.engine.frames.recording import POSES_BY, Recording
 from tofuse.engine.noise import NOISE
 from tofuse.engine.noise.model import family_of
 from tofuse.formats.cameras import read_noise, write_noise
@@ -39,7 +39,7 @@ def check_same(before: Recording, after: Recording, *, depth: float = 1e-6) -> N
         assert (old is None) == (new is None)
         if old is not None:
             np.testing.assert_allclose(new, old, atol=1e-6)
-    for key in ("sensor", "confidence_max", "frame_rate_hz"):
+    for key in ("sensor", "confidence_max", "frame_rate_hz", POSES_BY):
         assert after.metadata.get(key) == before.metadata.get(key)
     for a, b in zip(before, after, strict=True):
         assert (a.depth_kind, a.color_registered) == (b.depth_kind, b.color_registered)

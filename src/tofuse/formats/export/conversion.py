@@ -15,7 +15,14 @@ import numpy as np
 from tofuse.engine.arrays import UInt8
 from tofuse.engine.cameras import Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.engine.frames import CloudFrame, Frame, RangeFrame, Recording, depth_counts
+from tofuse.engine.frames import (
+    POSES_BY,
+    CloudFrame,
+    Frame,
+    RangeFrame,
+    Recording,
+    depth_counts,
+)
 from tofuse.engine.sensor import DepthCorrection
 from tofuse.formats.cameras import Rectifier, camera_file, pinhole_of
 from tofuse.formats.files import atomic, staging
@@ -130,7 +137,8 @@ def _writer(
     metadata = recording.metadata
     first = sample[0]
     properties: dict[str, Any] = {
-        name: metadata.get(name) for name in ("frame_rate_hz", "confidence_max", "sensor", "serial")
+        name: metadata.get(name)
+        for name in ("frame_rate_hz", "confidence_max", "sensor", "serial", POSES_BY)
     }
     if isinstance(first, CloudFrame):
         return RecordingWriter(folder, None, **properties)
