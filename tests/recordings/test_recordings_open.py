@@ -14,6 +14,9 @@ from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.noise import NOISE, noise_model_for
+from tofuse.formats.cameras import write_noise
+from tofuse.formats.export.conversion import convert
 from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording, readers
@@ -42,6 +45,18 @@ def test_several_paths_are_joined_in_given_order(tmp_path: Path) -> None:
     assert [f.timestamp for f in recording] == recording.timestamps.tolist()
     assert np.isfinite(recording.reference[:, 0, 0]).tolist() == [True] * 3 + [False] * 2
     assert recording.metadata["parts"] == [{"name": "b", "frames": 3}, {"name": "a", "frames": 2}]
+
+
+def test_noise_model_of_all_parts_is_that_of_the_whole(tmp_path: Path) -> None:
+    for name in "ab":
+        write(tmp_path / name, [1])
+        write_noise(tmp_path / name / "noise.json", NOISE["sr4000"])
+    joined = open_recording(tmp_path / "a", tmp_path / "b")
+    assert noise_model_for(joined) == noise_model_for(open_recording(tmp_path)) == NOISE["sr4000"]
+    copy = convert(joined, tmp_path / "copy").folder
+    assert noise_model_for(open_recording(copy)) == NOISE["sr4000"]
+    (tmp_path / "b" / "noise.json").unlink()
+    assert noise_model_for(open_recording(tmp_path / "a", tmp_path / "b")) == NOISE["unknown"]
 
 
 def test_folder_of_recordings_is_joined_in_name_order(tmp_path: Path) -> None:

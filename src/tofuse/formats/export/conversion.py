@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from tofuse.engine.arrays import UInt8
 from tofuse.engine.cameras import Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import (
+    NOISE_MODEL,
     POSES_BY,
     CloudFrame,
     Frame,
@@ -24,7 +24,7 @@ from tofuse.engine.frames import (
     depth_counts,
 )
 from tofuse.engine.sensor import DepthCorrection
-from tofuse.formats.cameras import Rectifier, camera_file, pinhole_of
+from tofuse.formats.cameras import Rectifier, camera_file, pinhole_of, write_noise
 from tofuse.formats.files import atomic, staging
 from tofuse.formats.images import write_png
 from tofuse.formats.poses import write_log, write_tum
@@ -109,9 +109,8 @@ def _write(
         warnings.append(f"{writer.out_of_range} values were too large for 16 bits")
     if any(isinstance(f, CloudFrame) and f.origin.any() for f in sample):
         warnings.append("the sensor's position within its clouds is lost")
-    noise = Path(recording.path) / "noise.json"
-    if noise.is_file():
-        shutil.copyfile(noise, folder / "noise.json")
+    if NOISE_MODEL in recording.metadata:
+        write_noise(folder / "noise.json", recording.metadata[NOISE_MODEL])
     return len(written), warnings
 
 
