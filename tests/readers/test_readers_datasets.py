@@ -83,6 +83,17 @@ def test_tum(tmp_path: Path) -> None:
     assert third.camera == BrownConrady(640, 480, 535.4, 539.2, 320.1, 247.6)
 
 
+def test_tum_with_colour_of_half_the_rate(tmp_path: Path) -> None:
+    """No image is the colour of two frames."""
+    folder = tmp_path / "freiburg1"
+    make_tum(folder)
+    lines = (folder / "rgb.txt").read_text().splitlines()
+    (folder / "rgb.txt").write_text("\n".join(lines[::2]) + "\n")
+    recording = open_recording(folder)
+    assert [frame.color_image is None for frame in recording] == [True, False, True]
+    assert "only 1 of 3 frames have colour" in recording.warnings
+
+
 def test_tum_with_unknown_name_requires_camera(tmp_path: Path) -> None:
     make_tum(tmp_path / "living_room")
     with pytest.raises(InputError, match="--camera"):

@@ -479,6 +479,17 @@ def test_colour_of_separate_camera(tmp_path: Path, kind: str, compressed: bool) 
         assert (frame.color_image[seen][:, 2] == 50 + k).all()
 
 
+def test_no_image_is_the_colour_of_two_frames(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "mcap")
+    bag.info("/camera/depth/camera_info", D=())
+    for time in (10.0, 10.011, 10.022):  # 90 frames per second
+        bag.image(TOPIC, time, COUNTS[0], "16UC1")
+    image = np.ascontiguousarray(color_at(0)[:12, :16])
+    bag.image(COLOR_TOPIC, 10.01, image, "rgb8", width=16)
+    frames = list(open_recording(bag.close()))
+    assert [frame.color_image is None for frame in frames] == [True, False, True]
+
+
 def test_static_transforms_of_early_publishers(tmp_path: Path) -> None:
     """They repeat them on /tf, which makes neither poses nor a camera that moves."""
     bag = Bag(tmp_path, "ros1")

@@ -186,7 +186,7 @@ class AzureKinectSource(FileSource):
             return [None] * len(self.depth)
         depth_times = np.array([b.time_ns - delay for b in self.depth]) / 1e9
         times = np.array([b.time_ns for b in track.blocks]) / 1e9
-        pairs = associate(depth_times, times, limit=limit, exclusive=False)
+        pairs = associate(depth_times, times, limit=limit)
         if (pairs < 0).any():
             self.warnings.append(
                 f"{int((pairs < 0).sum())} of {len(pairs)} frames have no {track.name} image"

@@ -154,7 +154,7 @@ def color_files(
     color = color_images(folder)
     color_times = timestamps(color)
     if times is not None and color_times is not None:
-        nearest = associate(times, color_times, limit=COLOR_LIMIT_S, exclusive=False)
+        nearest = associate(times, color_times, limit=COLOR_LIMIT_S)
         matches = [color[k] if k >= 0 else None for k in nearest]
     else:
         named = {file.stem: file for file in color}

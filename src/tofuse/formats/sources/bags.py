@@ -8,13 +8,14 @@ import tempfile
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float32, Float64, UInt8
+from tofuse.engine.arrays import Float32, Float64, Intp, UInt8
 from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, depth_counts
@@ -24,6 +25,7 @@ from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.geometry import unpacked_color
 from tofuse.formats.images import as_color, parse_image
+from tofuse.formats.poses import associate
 from tofuse.formats.sources.file_source import FileSource
 from tofuse.formats.sources.pixels import finite_float32, sampled_color
 from tofuse.formats.sources.reader import ReaderOptions
@@ -223,10 +225,10 @@ class BagSource(FileSource):
         time = float(self.timestamps[index])
         depth = self.read_depth(index, where)
         frame = self.image(index, depth, amplitude_image=self._amplitude_at(time, where))
-        k = None if self.color is None else self.color.nearest(time, MAX_GAP_S)
-        if self.color is None or k is None:
+        message = self._color_messages[index]
+        if self.color is None or message < 0:
             return frame
-        track, message, where = self.color, k, f"{where}, colour"
+        track, where = self.color, f"{where}, colour"
 
         def read_color() -> UInt8:
             with reading.library_errors(where, REMEDY):
@@ -234,6 +236,12 @@ class BagSource(FileSource):
             return sampled_color(frame, color, self.color_camera, where)
 
         return replace(frame, color_image=self.color_if_readable(index, read_color))
+
+    @cached_property
+    def _color_messages(self) -> Intp:
+        """The message (N,) with the colour of each frame, or -1."""
+        times = () if self.color is None else self.color.times
+        return associate(self.timestamps, times, limit=MAX_GAP_S)
 
     def read_depth(self, index: int, where: str) -> Float32:
         """Return the depth (H, W) of a frame in m."""
