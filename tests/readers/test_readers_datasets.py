@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -245,6 +246,8 @@ def test_redwood_uses_what_recorders_of_open3d_state(tmp_path: Path) -> None:
     facts |= {"intrinsic_matrix": rows}
     (tmp_path / "intrinsic.json").write_text(json.dumps(facts))
     assert open_recording(tmp_path)[0].camera == frame.camera
+    shutil.rmtree(tmp_path / "color")
+    assert open_recording(tmp_path).format == "redwood"
     facts |= {"depth_scale": 0.001}
     (tmp_path / "intrinsic.json").write_text(json.dumps(facts))
     with pytest.raises(InputError, match=r"intrinsic\.json: depth_scale: is 0\.001"):

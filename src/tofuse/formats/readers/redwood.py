@@ -37,11 +37,11 @@ class Redwood(Reader):
         if not reading.is_folder(path / "depth") or reading.is_file(path / "depth.txt"):
             return None
         color = next((n for n in _COLOR_FOLDERS if reading.is_folder(path / n)), None)
-        if color is None:
-            return None
         camera = _camera_file(path)
+        if color is None and (camera is None or reading.is_file(path / "camera.json")):
+            return None
         if camera is not None:
-            return Sniff(1.0, f"depth/, {color}/ and {camera.name}")
+            return Sniff(1.0, f"depth/{'' if color is None else f', {color}/'} and {camera.name}")
         if reading.is_file(path / "trajectory.log"):
             return Sniff(1.0, f"depth/, {color}/ and trajectory.log")
         if reading.is_file(path / "camera.json"):
