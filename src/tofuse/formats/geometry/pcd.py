@@ -52,6 +52,11 @@ class Pcd:
         """Whether the points form an image."""
         return self.height > 1 and self.width > 1
 
+    @property
+    def image(self) -> NDArray[np.floating]:
+        """(H, W, 3) points of an organised cloud."""
+        return self.cloud.points.reshape(self.height, self.width, 3)
+
 
 @dataclass(frozen=True)
 class _Header:
