@@ -18,6 +18,7 @@ from tofuse.engine.noise import NOISE, noise_model_for
 from tofuse.formats.cameras import write_noise
 from tofuse.formats.export.conversion import convert
 from tofuse.formats.geometry.ply import write_ply
+from tofuse.formats.recordings.joined import JoinedSource
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording, readers
 
@@ -45,6 +46,10 @@ def test_several_paths_are_joined_in_given_order(tmp_path: Path) -> None:
     assert [f.timestamp for f in recording] == recording.timestamps.tolist()
     assert np.isfinite(recording.reference[:, 0, 0]).tolist() == [True] * 3 + [False] * 2
     assert recording.metadata["parts"] == [{"name": "b", "frames": 3}, {"name": "a", "frames": 2}]
+    twice = JoinedSource([recording.source, open_recording(tmp_path / "a").source], ["c", "d"])
+    found = [(part["name"], part["frames"]) for part in twice.metadata["parts"]]
+    assert found == [("c, b", 3), ("c, a", 2), ("d", 2)]
+    assert twice.read(6).points[0, 2] == 2
 
 
 def test_noise_model_of_all_parts_is_that_of_the_whole(tmp_path: Path) -> None:
