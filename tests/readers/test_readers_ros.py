@@ -479,6 +479,16 @@ def test_colour_of_separate_camera(tmp_path: Path, kind: str, compressed: bool) 
         assert (frame.color_image[seen][:, 2] == 50 + k).all()
 
 
+def test_colour_that_the_azure_kinect_driver_registers(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros1")
+    bag.info("/depth/camera_info", D=())
+    bag.image("/depth/image_raw", 10.0, COUNTS[0], "16UC1")
+    image = np.dstack([color_at(0)[:12, :16, ::-1], np.full((12, 16), 255, np.uint8)])
+    bag.image("/rgb_to_depth/image_raw", 10.0, image, "bgra8", width=16)
+    frame = open_recording(bag.close())[0]
+    np.testing.assert_array_equal(frame.color_image, color_at(0)[:12, :16])
+
+
 def test_no_image_is_the_colour_of_two_frames(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "mcap")
     bag.info("/camera/depth/camera_info", D=())

@@ -257,7 +257,7 @@ class RosSource(bags.BagSource):
         return True
 
     def _is_color(self, connection: Any) -> bool:
-        topic = connection.topic.lower()
+        topic = connection.topic.lower().replace("to_depth", "")  # registered to it
         if "depth" in topic or not any(keyword in topic for keyword in _COLOR_KEYWORDS):
             return False
         if connection.msgtype == COMPRESSED:
