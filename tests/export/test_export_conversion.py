@@ -25,6 +25,7 @@ from tofuse.formats.cameras import read_noise, write_noise
 from tofuse.formats.export.conversion import convert
 from tofuse.formats.readers.native import NativeSource
 from tofuse.formats.recordings.open import open_recording
+from tofuse.formats.rigs.rig_file import Rig, RigCamera, write_rig
 
 CHANNELS = ("amplitude_image", "confidence_image", "color_image")
 
@@ -150,6 +151,17 @@ def test_convert_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert main([*words[:-1], str(tmp_path / "new"), "--start", "7"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "new").exists()
+
+
+def test_rig_is_refused(tmp_path: Path) -> None:
+    """As one recording it would be a single camera that jumps."""
+    for name in ("left", "right"):
+        make_native(tmp_path / "rig" / name)
+    cameras = [RigCamera(n, n, np.eye(4), np.zeros((6, 6))) for n in ("left", "right")]
+    write_rig(tmp_path / "rig" / "rig.json", Rig(tuple(cameras)))
+    with pytest.raises(InputError, match=r"is a rig, .* one by one"):
+        convert(open_recording(tmp_path / "rig"), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_failed_conversion_leaves_nothing(tmp_path: Path) -> None:

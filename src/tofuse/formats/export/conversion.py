@@ -79,6 +79,7 @@ def convert(
 def _write(
     recording: Recording, folder: Path, progress: Callable[[int], None] | None
 ) -> tuple[int, list[str]]:
+    _check_one_camera(recording)
     warnings: list[str] = []
     recording, correction = _uncorrected(recording)
     sample = recording.readable(_SAMPLED_FRAMES)
@@ -112,6 +113,15 @@ def _write(
     if NOISE_MODEL in recording.metadata:
         write_noise(folder / "noise.json", recording.metadata[NOISE_MODEL])
     return len(written), warnings
+
+
+def _check_one_camera(recording: Recording) -> None:
+    if "cameras" in recording.metadata:
+        raise InputError(
+            "is a rig, and a folder like this holds one camera",
+            where=recording.path,
+            remedy="convert its recordings one by one",
+        )
 
 
 def _uncorrected(recording: Recording) -> tuple[Recording, DepthCorrection | None]:
@@ -271,6 +281,7 @@ def convert_to(recording: Recording, folder: str | Path, layout: Layout) -> Conv
 
 
 def _write_layout(recording: Recording, folder: Path, layout: Layout) -> tuple[int, list[str]]:
+    _check_one_camera(recording)
     warnings: list[str] = []
     color_folder = "rgb" if layout == "tum" else "color"
     rectifier: Rectifier | None = None
