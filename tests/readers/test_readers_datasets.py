@@ -92,6 +92,7 @@ def test_tum_with_colour_of_half_the_rate(tmp_path: Path) -> None:
     (folder / "rgb.txt").write_text("\n".join(lines[::2]) + "\n")
     recording = open_recording(folder)
     assert [frame.color_image is None for frame in recording] == [True, False, True]
+    assert [recording.source.has_color(k) for k in range(3)] == [False, True, False]
     assert "only 1 of 3 frames have colour" in recording.warnings
 
 

@@ -496,8 +496,9 @@ def test_no_image_is_the_colour_of_two_frames(tmp_path: Path) -> None:
         bag.image(TOPIC, time, COUNTS[0], "16UC1")
     image = np.ascontiguousarray(color_at(0)[:12, :16])
     bag.image(COLOR_TOPIC, 10.01, image, "rgb8", width=16)
-    frames = list(open_recording(bag.close()))
-    assert [frame.color_image is None for frame in frames] == [True, False, True]
+    recording = open_recording(bag.close())
+    assert [frame.color_image is None for frame in recording] == [True, False, True]
+    assert [recording.source.has_color(k) for k in range(3)] == [False, True, False]
 
 
 def test_static_transforms_of_early_publishers(tmp_path: Path) -> None:

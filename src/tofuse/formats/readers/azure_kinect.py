@@ -167,6 +167,10 @@ class AzureKinectSource(FileSource):
             )
         return np.frombuffer(data, ">u2").reshape(height, width).astype(np.uint16)
 
+    def has_color(self, index: int) -> bool:
+        """See `FileSource.has_color`."""
+        return self.color[index] is not None
+
     def _color_image(self, index: int, frame: RangeFrame) -> UInt8 | None:
         block = self.color[index]
         if block is None or self.color_camera is None:

@@ -237,6 +237,10 @@ class BagSource(FileSource):
 
         return replace(frame, color_image=self.color_if_readable(index, read_color))
 
+    def has_color(self, index: int) -> bool:
+        """See `FileSource.has_color`."""
+        return bool(self._color_messages[index] >= 0)
+
     @cached_property
     def _color_messages(self) -> Intp:
         """The message (N,) with the colour of each frame, or -1."""
