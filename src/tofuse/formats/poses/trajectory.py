@@ -176,12 +176,12 @@ def associate(
     others: ArrayLike,
     *,
     limit: float = ASSOCIATION_LIMIT_S,
-    exclusive: bool = True,
 ) -> Intp:
     """Return for each of (N,) timestamps the index of the nearest of (M,) others, or -1.
 
-    Both are in s, in any order. Matches are within `limit` seconds (inclusive, plus a nanosecond);
-    if `exclusive`, each of the others is matched at most once, to the nearest timestamp.
+    Both are in s, in any order. Matches are within `limit` seconds (inclusive, plus a nanosecond).
+    Each of the others is matched at most once, to the nearest timestamp: an image that served two
+    frames would say that nothing moved between them.
     """
     times, others = np.asarray(timestamps, float), np.asarray(others, float)
     index = np.full(len(times), -1, np.intp)
@@ -198,7 +198,7 @@ def associate(
     matched = np.zeros(len(ordered), bool)
     for k in np.argsort(gap, kind="stable"):
         if gap[k] <= limit + 1e-9 and not matched[best[k]]:
-            matched[best[k]] = exclusive
+            matched[best[k]] = True
             index[k] = order[best[k]]
     return index
 

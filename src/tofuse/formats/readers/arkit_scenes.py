@@ -74,7 +74,7 @@ def _times(files: list[Path]) -> Float64:
 def _of_frames(folder: Path, suffix: str, times: Float64) -> list[Path | None]:
     """The file of each frame; None where there is none."""
     files = inputs.files_at(folder, suffix)
-    nearest = associate(times, _times(files), limit=_LIMIT_S, exclusive=False)
+    nearest = associate(times, _times(files), limit=_LIMIT_S)
     return [files[k] if k >= 0 else None for k in nearest]
 
 

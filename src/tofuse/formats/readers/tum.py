@@ -74,8 +74,7 @@ class Tum(Reader):
         color: list[Path | None] | None = None
         if len(lists) > 1:
             color_times, color_files = lists[1]
-            # A depth image without a colour image takes that of a neighbour: only for display.
-            pairs = associate(times, color_times, limit=COLOR_LIMIT_S, exclusive=False)
+            pairs = associate(times, color_times, limit=COLOR_LIMIT_S)
             if (pairs >= 0).any():
                 exists = [reading.is_file(file) for file in color_files]
                 color = [color_files[k] if k >= 0 and exists[k] else None for k in pairs]
