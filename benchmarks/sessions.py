@@ -28,10 +28,10 @@ from made_once import made_once
 from tofuse.apps.jobs.merging import MergeOptions, merge_files
 from tofuse.apps.jobs.run_options import Options
 from tofuse.apps.jobs.running import run
-from tofuse.apps.report.session_words import probability_text
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.trajectory_errors import align, displacement
+from tofuse.engine.quantities import probability
 from tofuse.engine.results.types import Reconstruction
 from tofuse.lab.scenes import flat, furniture
 from tofuse.lab.scenes.composition import Assembly, placed
@@ -284,9 +284,7 @@ def row(case: Case, result: Reconstruction, truth: Sequence[Float64]) -> str:
         f"{1e3 * metres:.1f} mm, {np.degrees(angle):.2f}°" if joined else "-",
         *(f"{1e3 * a:.1f} mm" if np.isfinite(a) else "-" for a in (*ates, ate)),
         f"{1e3 * result.diagnostics.accuracy.position_m:.0f} mm",
-        "-"
-        if pair.probability is None
-        else f"{probability_text(pair.probability)}, {pair.links} links",
+        "-" if pair.probability is None else f"{probability(pair.probability)}, {pair.links} links",
         ", ".join(c.change.kind for c in result.changes) or "-",
     ]
     return "| " + " | ".join(cells) + " |"

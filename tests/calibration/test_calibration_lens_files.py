@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -78,6 +79,13 @@ def test_ros_camera_info_is_read(
     assert found.camera == expected(800, 600, 538.63, 539.723, 457.698, 297.003, *values)
     blocks = text.replace(f"data: {values}", "data:\n" + "\n".join(f"  - {v}" for v in values))
     assert read_lens_file(written(tmp_path, "b.yaml", blocks)).camera == found.camera
+
+
+def test_matrix_of_open3d_is_column_by_column(tmp_path: Path) -> None:
+    matrix = [538.0, 0, 0, 0, 539.0, 0, 457.0, 297.0, 1]
+    about = {"width": 800, "height": 600, "intrinsic_matrix": matrix}
+    found = read_lens_file(written(tmp_path, "a.json", json.dumps(about)))
+    assert found.camera == BrownConrady(800, 600, 538.0, 539.0, 457.0, 297.0)
 
 
 @pytest.mark.parametrize(

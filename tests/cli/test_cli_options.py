@@ -105,6 +105,14 @@ def test_invalid_numbers_name_their_option(words: str, capfd) -> None:
 
 
 @pytest.mark.parametrize(
+    "words", [("run", "", "--out", "out"), ("run", "rec", "--out", ""), ("view", "")]
+)
+def test_empty_path_is_not_the_current_folder(words: tuple[str, ...], capfd) -> None:
+    """That of a shell variable that is not set."""
+    refuses(capfd, *words, says=("not a path",), prefix="tofuse")
+
+
+@pytest.mark.parametrize(
     ("text", "size"), [("4GB", 4_000_000_000), ("1.5 mb", 1_500_000), ("2GiB", 2 << 30), ("7", 7)]
 )
 def test_memory_sizes_are_parsed(text: str, size: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.engine.frames.recording import Recording
+from tofuse.engine.frames.recording import POSES_BY, Recording
 from tofuse.engine.noise import NOISE
 from tofuse.engine.noise.model import family_of
 from tofuse.formats.cameras import read_noise, write_noise
@@ -25,6 +26,7 @@ from tofuse.formats.export.conversion import convert
 from tofuse.formats.readers.native import NativeSource
 from tofuse.formats.recordings import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
+from tofuse.formats.rigs.rig_file import Rig, RigCamera, write_rig
 
 CHANNELS = ("amplitude_image", "confidence_image", "color_image")
 
@@ -39,7 +41,7 @@ def check_same(before: Recording, after: Recording, *, depth: float = 1e-6) -> N
         assert (old is None) == (new is None)
         if old is not None:
             np.testing.assert_allclose(new, old, atol=1e-6)
-    for key in ("sensor", "confidence_max", "frame_rate_hz"):
+    for key in ("sensor", "confidence_max", "frame_rate_hz", POSES_BY):
         assert after.metadata.get(key) == before.metadata.get(key)
     for a, b in zip(before, after, strict=True):
         assert (a.depth_kind, a.color_registered) == (b.depth_kind, b.color_registered)
@@ -74,6 +76,20 @@ def test_every_camera(tmp_path: Path, name: str) -> None:
     rounded = 1e-6 if "depth_unit_m" in before.metadata else 0.51e-4
     check_same(before, open_recording(tmp_path / "out"), depth=rounded)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "scan"]
+
+
+def test_depth_stored_as_floats(tmp_path: Path) -> None:
+    """A unit of 1 m, as of float arrays, is no count to which depth is rounded."""
+    folder = tmp_path / "native"
+    make_native(folder)
+    about = json.loads((folder / "camera.json").read_text()) | {"depth_unit_m": 1.0}
+    (folder / "camera.json").write_text(json.dumps(about))
+    for k, path in enumerate(sorted((folder / "depth").iterdir())):
+        depth = np.linspace(1, 2 + k, about["height"] * about["width"], dtype=np.float32)
+        np.save(path.with_suffix(".npy"), depth.reshape(about["height"], about["width"]))
+        path.unlink()
+    before = open_recording(folder)
+    check_same(before, open_recording(convert(before, tmp_path / "out").folder), depth=6e-5)
 
 
 def test_rays_of_each_frame(tmp_path: Path) -> None:
@@ -136,6 +152,17 @@ def test_convert_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert main([*words[:-1], str(tmp_path / "new"), "--start", "7"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "new").exists()
+
+
+def test_rig_is_refused(tmp_path: Path) -> None:
+    """As one recording it would be a single camera that jumps."""
+    for name in ("left", "right"):
+        make_native(tmp_path / "rig" / name)
+    cameras = [RigCamera(n, n, np.eye(4), np.zeros((6, 6))) for n in ("left", "right")]
+    write_rig(tmp_path / "rig" / "rig.json", Rig(tuple(cameras)))
+    with pytest.raises(InputError, match=r"is a rig, .* one by one"):
+        convert(open_recording(tmp_path / "rig"), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_failed_conversion_leaves_nothing(tmp_path: Path, monkeypatch) -> None:

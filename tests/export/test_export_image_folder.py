@@ -25,6 +25,7 @@ from tofuse.engine.geometry.rays import homogeneous
 from tofuse.formats.geometry.ply import read_ply
 from tofuse.formats.poses.trajectory import read_tum, write_tum
 from tofuse.formats.poses.trajectory_formats import read_poses
+from tofuse.formats.readers.native import NativeSource
 from written_run_json import change_run
 
 PLAIN = Pinhole(*SIZE, 40.0, 41.0, 23.0, 18.0)
@@ -111,6 +112,19 @@ def test_colmap_text_files(tmp_path: Path) -> None:
         "frame_000000.png",
         "frame_000003.png",
     ]
+
+
+def test_colour_keeps_its_recorded_resolution(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = np.random.default_rng(6).integers(1, 255, (72, 96, 3)).astype(np.uint8)
+    monkeypatch.setattr(NativeSource, "full_resolution_color", lambda _self, _index: full)
+    (folder,) = export(made_result(tmp_path, PLAIN), ["nerfstudio"])
+    data = json.loads((folder / "transforms.json").read_text())
+    assert [data[name] for name in ("w", "h", "fl_x", "cx")] == [96, 72, 80.0, 47.0]
+    frame = data["frames"][1]
+    np.testing.assert_array_equal(cv2.imread(str(folder / frame["file_path"]))[..., ::-1], full)
+    assert cv2.imread(str(folder / frame["depth_file_path"]), -1).shape == (36, 48)
 
 
 def test_corrected_camera_is_written(tmp_path: Path) -> None:

@@ -264,6 +264,10 @@ def test_jump_of_odometry_is_left_out():
     jumped[30:, :3, 3] += [0.5, 0, 0.2]
     measured = measure_all((OdometryEdges(),), sensed(jumped), graph)
     assert {step.i for step in measured.steps} == set(range(N - 1)) - {29}
+    # It says nothing about the errors of the others, and is not in longer motions.
+    assert measured.is_reliable
+    [without] = measure_all((OdometryEdges(),), sensed(odometer(right)), graph).records
+    assert measured.records[0].scale == pytest.approx(without.scale, rel=0.1)
     # Nor are there steps across missing odometry or the start of another recording.
     holes = odometer(right)
     holes[10] = np.nan
@@ -282,7 +286,7 @@ def test_odometry_from_the_same_depth_is_no_evidence():
     same = odometer(graph.poses, 0.0005)
     measured = measure_all((OdometryEdges(),), sensed(same), graph)
     assert not measured.steps
-    assert not measured.is_continuous
+    assert not measured.is_reliable
     assert "computed from it" in measured.records[0].text
     wall = (np.arange(N) >= 20) & (np.arange(N) < 24)
     measured = measure_all((OdometryEdges(),), sensed(same, degenerate=wall), graph)

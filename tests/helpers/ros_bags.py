@@ -150,16 +150,25 @@ class Bag:
         light: np.ndarray,
         height: int = 1,
         dtype: str = "<f4",
+        color: np.ndarray | None = None,
+        pad: int = 0,
     ) -> None:
+        """With packed `color` (N, 3), and with `pad` more points' bytes at the end of each row."""
         field = "sensor_msgs/msg/PointField"
         names, size = ("x", "y", "z", "intensity"), np.dtype(dtype).itemsize
         kind = {"f4": 7, "f8": 8}[dtype[1:]]
         fields = [self.make(field, n, size * k, kind, 1) for k, n in enumerate(names)]
         data = np.concatenate([points, light[:, None]], 1).astype(dtype)
-        content = np.frombuffer(data.tobytes(), np.uint8)
+        if color is not None:
+            fields.append(self.make(field, "rgb", 4 * size, 7, 1))
+            packed = np.c_[color[:, ::-1], np.zeros(len(color))].astype("u1").view(dtype)
+            data = np.concatenate([data, packed], 1)
+        rows = data.reshape(height, -1)
+        rows = np.pad(rows, ((0, 0), (0, pad * len(fields))), constant_values=9)
+        content = np.frombuffer(rows.tobytes(), np.uint8)
         message = self.make(
             ros.CLOUD, self.header(time), height, len(data) // height, fields, dtype[0] == ">",
-            4 * size, 4 * size * len(data) // height, content, True,
+            len(fields) * size, len(content) // height, content, True,
         )  # fmt: skip
         self.write(topic, ros.CLOUD, time, message)
 

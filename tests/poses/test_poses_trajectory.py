@@ -7,7 +7,7 @@ import pytest
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry.se3 import exp
-from tofuse.engine.times import MAX_GAP_S, associate, nearest
+from tofuse.engine.times import MAX_GAP_S, associate, nearest, partners
 from tofuse.formats.poses.trajectory import (
     read_tum,
     tum_text,
@@ -101,3 +101,5 @@ def test_association_matches_slow_search() -> None:
         expected.append((i, j))
         gaps[i], gaps[:, j] = np.inf, np.inf
     assert associate(a, b).tolist() == [list(pair) for pair in sorted(expected)]
+    found = dict(sorted(expected))
+    assert partners(a, b).tolist() == [found.get(i, -1) for i in range(len(a))]

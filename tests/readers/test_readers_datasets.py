@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,18 @@ def test_tum(tmp_path: Path) -> None:
     assert recording.odometry is None
     third = open_recording(folder.rename(tmp_path / "fr3_office"))[0]
     assert third.camera == BrownConrady(640, 480, 535.4, 539.2, 320.1, 247.6)
+
+
+def test_tum_with_colour_of_half_the_rate(tmp_path: Path) -> None:
+    """No image is the colour of two frames."""
+    folder = tmp_path / "freiburg1"
+    make_tum(folder)
+    lines = (folder / "rgb.txt").read_text().splitlines()
+    (folder / "rgb.txt").write_text("\n".join(lines[::2]) + "\n")
+    recording = open_recording(folder)
+    assert [frame.color_image is None for frame in recording] == [True, False, True]
+    assert [recording.source.has_color(k) for k in range(3)] == [False, True, False]
+    assert "only 1 of 3 frames have colour" in recording.warnings
 
 
 def test_tum_with_unknown_name_requires_camera(tmp_path: Path) -> None:
@@ -234,6 +247,8 @@ def test_redwood_uses_what_recorders_of_open3d_state(tmp_path: Path) -> None:
     facts |= {"intrinsic_matrix": rows}
     (tmp_path / "intrinsic.json").write_text(json.dumps(facts))
     assert open_recording(tmp_path)[0].camera == frame.camera
+    shutil.rmtree(tmp_path / "color")
+    assert open_recording(tmp_path).format == "redwood"
     facts |= {"depth_scale": 0.001}
     (tmp_path / "intrinsic.json").write_text(json.dumps(facts))
     with pytest.raises(InputError, match=r"intrinsic\.json: depth_scale: is 0\.001"):
@@ -300,10 +315,32 @@ def test_colour_of_camera_in_given_camera_json(tmp_path: Path) -> None:
 def test_redwood_with_fewer_colour_images_of_other_names(tmp_path: Path) -> None:
     make_redwood(tmp_path)
     (tmp_path / "color" / "000001.png").unlink()
-    for path in (tmp_path / "color").iterdir():
-        path.rename(path.with_name(f"photo {path.name}"))
+    for path, name in zip((tmp_path / "color").iterdir(), "ab", strict=True):
+        path.rename(path.with_name(f"photo {name}.png"))
     recording = open_recording(tmp_path, format="redwood")
     assert any("their names don't show which belong together" in w for w in recording.warnings)
+
+
+@pytest.mark.parametrize("names", ["{1:06d}.png", "{0}_{1:04d}.png"])
+def test_redwood_with_other_images_missing_of_each_kind(tmp_path: Path, names: str) -> None:
+    """As many images of each kind, but not of the same frames."""
+    image = np.zeros((480, 640, 3), np.uint8)
+    for name, frames in (("depth", (0, 1, 3, 4)), ("color", (0, 1, 2, 4))):
+        (tmp_path / name).mkdir()
+        for k in frames:
+            file = tmp_path / name / names.format(name, k)
+            write_png(file, COUNTS[0] if name == "depth" else image + 40 * k)
+    recording = open_recording(tmp_path, format="redwood")
+    assert any("only 3 of 4 frames have colour" in w for w in recording.warnings)
+    colors = [None if f.color_image is None else f.color_image[0, 0, 0] for f in recording]
+    assert colors == [0, 40, None, 160]
+    # Counted from another number.
+    for k, path in enumerate(sorted((tmp_path / "depth").iterdir())):
+        path.rename(path.with_name(f"{k:06d}.png"))
+    for k, path in enumerate(sorted((tmp_path / "color").iterdir())):
+        path.rename(path.with_name(f"{k + 10:06d}.png"))
+    colors = [f.color_image[0, 0, 0] for f in open_recording(tmp_path, format="redwood")]
+    assert colors == [0, 40, 80, 160]
 
 
 def test_redwood_without_camera_is_ambiguous(tmp_path: Path) -> None:

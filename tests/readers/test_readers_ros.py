@@ -19,6 +19,7 @@ from ros_bags import (
     COLOR_V,
     COLORS,
     COUNTS,
+    DEPTH_LENS,
     RNG,
     STEP,
     T_COLOR,
@@ -83,6 +84,23 @@ def test_lens_of_rectified_images(tmp_path: Path, topic: str, rectified: bool) -
     camera = open_recording(bag.close())[0].camera
     raw = BrownConrady(16, 12, 20.0, 21.0, 7.5, 5.5, k1=0.1, k2=0.02)
     assert camera == (Pinhole(16, 12, 18.0, 19.0, 7.25, 5.25) if rectified else raw)
+
+
+@pytest.mark.parametrize(
+    ("topic", "own", "other"),
+    [
+        ("/camera/depth/image_raw", "/camera/depth/camera_info", "/camera/camera_info"),
+        ("/depth_image", "/depth_camera_info", "/color_camera_info"),
+    ],
+)
+def test_lens_is_that_of_the_topic_of_like_name(
+    tmp_path: Path, topic: str, own: str, other: str
+) -> None:
+    bag = Bag(tmp_path, "mcap")
+    bag.info(other, D=(), lens=Pinhole(16, 12, 30.0, 30.0, 8.0, 6.0))
+    bag.info(own, D=())
+    bag.image(topic, 10.0, COUNTS[0], "16UC1")
+    assert open_recording(bag.close())[0].camera == DEPTH_LENS
 
 
 def test_depth_of_depthai(tmp_path: Path) -> None:
@@ -171,9 +189,10 @@ def test_organised_clouds_become_images(tmp_path: Path) -> None:
     z[:, 2, 3] = np.nan
     v, u = np.mgrid[:12, :16].astype(np.float32)
     light = RNG.uniform(size=(4, 192)).astype(np.float32)
+    color = RNG.integers(0, 256, (192, 3)).astype(np.uint8)
     for k in range(4):
         points = np.stack([(u - 7.5) / 20 * z[k], (v - 5.5) / 21 * z[k], z[k]], -1)
-        bag.cloud("/tof/points", 10 + k, points.reshape(-1, 3), light[k], height=12)
+        bag.cloud("/tof/points", 10 + k, points.reshape(-1, 3), light[k], 12, color=color, pad=k)
     recording = open_recording(bag.close())
     for k in (0, 3):
         frame = recording[k]
@@ -181,6 +200,7 @@ def test_organised_clouds_become_images(tmp_path: Path) -> None:
         assert frame.valid.sum() == 191
         np.testing.assert_allclose(frame.camera.rays()[4, 9], (1.5 / 20, -1.5 / 21), atol=1e-5)
         np.testing.assert_array_equal(frame.amplitude_image, light[k].reshape(12, 16))
+        np.testing.assert_array_equal(frame.color_image, color.reshape(12, 16, 3))
 
 
 def test_infrared_of_same_pixels_is_the_amplitude(tmp_path: Path) -> None:
@@ -197,6 +217,39 @@ def test_infrared_of_same_pixels_is_the_amplitude(tmp_path: Path) -> None:
     for k, expected in ((0, bright[0]), (1, np.zeros((12, 16))), (2, bright[2])):
         frame = recording[k]
         np.testing.assert_array_equal(frame.amplitude_image, expected)
+
+
+def test_driver_restarted_during_recording(tmp_path: Path) -> None:
+    """A ROS 1 bag has one connection per publisher of a topic."""
+    bag = Bag(tmp_path, "ros1")
+    bag.info("/camera/depth/camera_info")
+    bag.image(TOPIC, 10.0, COUNTS[0], "16UC1")
+    bag.image(TOPIC, 10.1, COUNTS[1], "16UC1")
+    bag.connections[TOPIC] = bag.writer.add_connection(
+        TOPIC, "sensor_msgs/msg/Image", typestore=bag.store, callerid="/restarted"
+    )
+    bag.image(TOPIC, 10.2, COUNTS[2], "16UC1")
+    recording = open_recording(bag.close())
+    np.testing.assert_allclose([f.z for f in recording], COUNTS / 1000, rtol=1e-6)
+    np.testing.assert_allclose(recording[1].z, COUNTS[1] / 1000, rtol=1e-6)
+
+
+def test_amplitude_and_colour_are_of_the_same_camera(tmp_path: Path) -> None:
+    """Of several equal cameras of a robot."""
+    bag = Bag(tmp_path, "mcap")
+    for k, name in enumerate(("front", "rear")):
+        bag.info(f"/{name}/depth/camera_info", D=())
+        bag.image(f"/{name}/depth/image_raw", 10, COUNTS[k], "16UC1", frame=name)
+        bag.image(f"/{name}/ir/image_raw", 10, COUNTS[k], "mono16", frame=name)
+        color = np.full((12, 16, 3), 50 + k, np.uint8)
+        bag.image(f"/{name}/color/image_raw", 10, color, "rgb8", frame=name, width=16)
+        bag.info(f"/{name}/color/camera_info", D=())
+        bag.tf("/tf_static", 9.0, "base", name, np.eye(4))
+    path = bag.close()
+    for k, name in enumerate(("front", "rear")):
+        frame = open_recording(path, topic=f"/{name}/depth/image_raw")[0]
+        np.testing.assert_array_equal(frame.amplitude_image, COUNTS[k])
+        assert frame.color_image.max() == 50 + k
 
 
 def test_topic_can_be_chosen(tmp_path: Path) -> None:
@@ -424,6 +477,42 @@ def test_colour_of_separate_camera(tmp_path: Path, kind: str, compressed: bool) 
         np.testing.assert_array_equal(frame.color_image[seen][:, 0], 8 * uv[:, 0])
         np.testing.assert_array_equal(frame.color_image[seen][:, 1], 10 * uv[:, 1])
         assert (frame.color_image[seen][:, 2] == 50 + k).all()
+
+
+def test_colour_that_the_azure_kinect_driver_registers(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros1")
+    bag.info("/depth/camera_info", D=())
+    bag.image("/depth/image_raw", 10.0, COUNTS[0], "16UC1")
+    image = np.dstack([color_at(0)[:12, :16, ::-1], np.full((12, 16), 255, np.uint8)])
+    bag.image("/rgb_to_depth/image_raw", 10.0, image, "bgra8", width=16)
+    frame = open_recording(bag.close())[0]
+    np.testing.assert_array_equal(frame.color_image, color_at(0)[:12, :16])
+
+
+def test_no_image_is_the_colour_of_two_frames(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "mcap")
+    bag.info("/camera/depth/camera_info", D=())
+    for time in (10.0, 10.011, 10.022):  # 90 frames per second
+        bag.image(TOPIC, time, COUNTS[0], "16UC1")
+    image = np.ascontiguousarray(color_at(0)[:12, :16])
+    bag.image(COLOR_TOPIC, 10.01, image, "rgb8", width=16)
+    recording = open_recording(bag.close())
+    assert [frame.color_image is None for frame in recording] == [True, False, True]
+    assert [recording.source.has_color(k) for k in range(3)] == [False, True, False]
+
+
+def test_static_transforms_of_early_publishers(tmp_path: Path) -> None:
+    """They repeat them on /tf, which makes neither poses nor a camera that moves."""
+    bag = Bag(tmp_path, "ros1")
+    depth_bag(bag)
+    bag.info("/camera/color/camera_info", D=(), lens=RGB_LENS)
+    for time in (9.0, 9.1, 10.1):
+        bag.tf("/tf", time, "rig", "depth", T_RIG_DEPTH)
+        bag.tf("/tf", time, "rig", "color", T_RIG_COLOR)
+    bag.image(COLOR_TOPIC, 10.0, color_at(0), "rgb8", frame="color", width=32)
+    recording = open_recording(bag.close())
+    assert recording.reference is None
+    assert recording[0].color_image is not None
 
 
 def test_colour_registered_to_depth(tmp_path: Path) -> None:

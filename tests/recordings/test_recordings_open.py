@@ -14,7 +14,11 @@ from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.noise import NOISE, noise_model_for
+from tofuse.formats.cameras import write_noise
+from tofuse.formats.export.conversion import convert
 from tofuse.formats.geometry.ply import write_ply
+from tofuse.formats.recordings.joined import JoinedSource
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording, readers
 
@@ -42,6 +46,22 @@ def test_several_paths_are_joined_in_given_order(tmp_path: Path) -> None:
     assert [f.timestamp for f in recording] == recording.timestamps.tolist()
     assert np.isfinite(recording.reference[:, 0, 0]).tolist() == [True] * 3 + [False] * 2
     assert recording.metadata["parts"] == [{"name": "b", "frames": 3}, {"name": "a", "frames": 2}]
+    twice = JoinedSource([recording.source, open_recording(tmp_path / "a").source], ["c", "d"])
+    found = [(part["name"], part["frames"]) for part in twice.metadata["parts"]]
+    assert found == [("c, b", 3), ("c, a", 2), ("d", 2)]
+    assert twice.read(6).points[0, 2] == 2
+
+
+def test_noise_model_of_all_parts_is_that_of_the_whole(tmp_path: Path) -> None:
+    for name in "ab":
+        write(tmp_path / name, [1])
+        write_noise(tmp_path / name / "noise.json", NOISE["sr4000"])
+    joined = open_recording(tmp_path / "a", tmp_path / "b")
+    assert noise_model_for(joined) == noise_model_for(open_recording(tmp_path)) == NOISE["sr4000"]
+    copy = convert(joined, tmp_path / "copy").folder
+    assert noise_model_for(open_recording(copy)) == NOISE["sr4000"]
+    (tmp_path / "b" / "noise.json").unlink()
+    assert noise_model_for(open_recording(tmp_path / "a", tmp_path / "b")) == NOISE["unknown"]
 
 
 def test_folder_of_recordings_is_joined_in_name_order(tmp_path: Path) -> None:
@@ -59,6 +79,10 @@ def test_folder_with_single_recording_stands_for_it(tmp_path: Path) -> None:
     (tmp_path / "Küche 1" / "notes.txt").write_text("")
     recording = open_recording(tmp_path / "Küche 1")
     assert (recording.format, len(recording)) == ("3dscannerapp", 3)
+    (tmp_path / "one" / "in").mkdir(parents=True)
+    (tmp_path / "Küche 1").rename(tmp_path / "one" / "in" / "another")
+    assert len(open_recording(tmp_path / "one")) == 3
+    (tmp_path / "one" / "in" / "another").rename(tmp_path / "Küche 1")
     make_scanner_app(tmp_path / "Küche 1" / "2026_11_29")
     with pytest.raises(InputError, match="several recordings: 2026_11_28"):
         open_recording(tmp_path / "Küche 1")
@@ -158,6 +182,8 @@ def test_paths_that_are_no_recordings(tmp_path: Path) -> None:
             open_recording(tmp_path / name)
     with pytest.raises(InputError, match="no recording was given"):
         open_recording()
+    with pytest.raises(InputError, match="is '', not a path"):
+        open_recording("")
     with pytest.raises(InputError, match="no format 'mp3'"):
         open_recording(tmp_path / "file", format="mp3")
 

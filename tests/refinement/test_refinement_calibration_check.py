@@ -70,8 +70,9 @@ def test_odometry_contradicts_errors_that_lead_away_from_it():
     views = [SampledView.of(prepare_view(frame, SHARP), 1500) for frame in frames]
     refined = refine(views, truth, OPTIONS)
 
-    def check(poses: np.ndarray) -> CalibrationCheck:
-        witness = se3.inverse(poses[0]) @ poses
+    def check(poses: np.ndarray, *runs: slice) -> CalibrationCheck:
+        rows = [np.arange(len(poses))[run] for run in runs or (slice(None),)]
+        witness = [(run, se3.inverse(poses[run[0]]) @ poses[run]) for run in rows]
         return check_calibration(
             RefinedViews(views, refined, OPTIONS, replace(Priors.none(), witness=witness))
         )
@@ -83,6 +84,9 @@ def test_odometry_contradicts_errors_that_lead_away_from_it():
     assert contradicted.errors["focal"] == pytest.approx(0.06, abs=0.01)
     assert not contradicted.alarm
     assert not contradicted.is_likely
+    # Also by odometry with a gap.
+    assert not check(truth, slice(6), slice(6, None)).contradicted
+    assert check(refined.poses, slice(6), slice(6, None)).contradicted
 
 
 def test_correct_camera_raises_no_alarm():

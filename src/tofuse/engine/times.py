@@ -27,8 +27,19 @@ def nearest(times: ArrayLike, queries: ArrayLike, limit: float = np.inf) -> Intp
     return np.where(np.minimum(gap_before, gap_after) <= limit + 1e-9, best, -1)
 
 
-def associate(times_a: ArrayLike, times_b: ArrayLike) -> Intp:
-    """Associate times one to one, less than `MAX_GAP_S` apart, closest first.
+def partners(times: ArrayLike, others: ArrayLike, limit: float = MAX_GAP_S) -> Intp:
+    """Return for each of (N,) times the position of its associate among (M,) others, or -1.
+
+    One to one: an image that served two frames would say that nothing moved between them.
+    """
+    pairs = associate(times, others, limit)
+    out = np.full(np.size(times), -1, np.intp)
+    out[pairs[:, 0]] = pairs[:, 1]
+    return out
+
+
+def associate(times_a: ArrayLike, times_b: ArrayLike, limit: float = MAX_GAP_S) -> Intp:
+    """Associate times one to one, less than `limit` seconds apart, closest first.
 
     Parameters
     ----------
@@ -46,7 +57,7 @@ def associate(times_a: ArrayLike, times_b: ArrayLike) -> Intp:
     while len(i) and len(j):
         partner = nearest(b[j], a[i])
         mutual = nearest(a[i], b[j])[partner] == np.arange(len(i))
-        mutual &= np.abs(a[i] - b[j[partner]]) < MAX_GAP_S
+        mutual &= np.abs(a[i] - b[j[partner]]) < limit
         if not mutual.any():
             break
         found.append(np.stack([i[mutual], j[partner[mutual]]], 1))

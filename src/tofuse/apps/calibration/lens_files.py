@@ -88,7 +88,10 @@ def read_lens_file(path: str | Path) -> LensFile:
             remedy=f"calibrate with {len(order)}, without thin prism or tilted sensor",
         )
     width, height = camera_file.image_size(size[0], size[1], f"{path}: image size")
-    values = pinhole_values(np.reshape(matrix, (3, 3)), (height, width), f"{path}: camera_matrix")
+    K = np.reshape(matrix, (3, 3))
+    if K[2, :2].any() and not K[:2, 2].any():  # Open3D writes it column by column
+        K = K.T
+    values = pinhole_values(K, (height, width), f"{path}: camera_matrix")
     values |= dict(zip(order, k, strict=False))
     camera = camera_file.checked_lens(MODELS[model], (width, height), values, path)
     return LensFile(camera, "opencv" if ros_model is None else "ros")

@@ -4,6 +4,7 @@ import argparse
 import math
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Any
 
 from tofuse.engine.bounds import Bounds
@@ -25,7 +26,16 @@ def reader(kind: type, extra: object) -> Callable[[str], Any]:
         return lambda text: _within(extra, _number(text, kind), text)
     if callable(extra):
         return extra
+    if kind is Path:
+        return _path
     return (lambda text: _number(text, kind)) if kind in (int, float) else kind
+
+
+def _path(text: str) -> Path:
+    """Read a path; an empty one, as of a shell variable that is not set, is no current folder."""
+    if not text:
+        raise argparse.ArgumentTypeError("'' is not a path")
+    return Path(text)
 
 
 def _number(text: str, kind: type) -> Any:

@@ -18,7 +18,6 @@ from tofuse.engine.fusion import texture
 from tofuse.engine.noise import noise_model_for
 from tofuse.engine.sensor import CameraErrors, Corrector
 from tofuse.formats.cameras import Rectifier, pinhole_of
-from tofuse.formats.sources import FileSource
 
 _WHITE_PERCENTILE = 99.0  # of the first frame's amplitude
 
@@ -102,7 +101,7 @@ def posed_frames(
                 is_kept = is_supported(camera) and isinstance(camera, Pinhole)
                 rectifier = Rectifier(cast(Pinhole, camera) if is_kept else pinhole_of(camera))
             rectified, image_camera = rectifier(frame), rectifier.pinhole
-            full_color = _full_color(recording, frame) if image_camera == camera else None
+            full_color = recording.full_color(frame) if image_camera == camera else None
             if full_color is not None:
                 image_camera = scaled(image_camera, full_color.shape[1], full_color.shape[0])
             index = part.first + frame.index
@@ -138,18 +137,6 @@ def _frames(
         for corrector in correctors:
             frame = corrector.apply(frame)
         yield frame
-
-
-def _full_color(recording: Recording, frame: RangeFrame) -> UInt8 | None:
-    """The colour of a frame at its recorded resolution; None if that is not above that of depth."""
-    source = recording.source
-    if frame.color_image is None or not isinstance(source, FileSource):
-        return None
-    try:
-        color = source.full_resolution_color(frame.index)
-    except InputError:
-        return None
-    return None if color is None or len(color) <= len(frame.color_image) else color
 
 
 class _Renderer:

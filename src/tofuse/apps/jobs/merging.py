@@ -166,12 +166,8 @@ def joined_recording(sessions: Sequence[Session]) -> tuple[Recording, list[int]]
         source = session.recording.source
         offsets.append(count)
         count += len(source.timestamps)
-        if isinstance(source, JoinedSource):
-            sources += source.parts
-            names += [f"{session.name}, {part['name']}" for part in source.metadata["parts"]]
-        else:
-            sources.append(source)
-            names.append(session.name)
+        sources.append(source)
+        names.append(session.name)
     indices = [s.recording.indices + offset for s, offset in zip(sessions, offsets, strict=True)]
     formats = dict.fromkeys(s.recording.format for s in sessions)
     path = " ".join(s.recording.path for s in sessions)

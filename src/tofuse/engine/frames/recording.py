@@ -12,7 +12,7 @@ from typing import Any, Protocol, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.compute import job_pool
 from tofuse.engine.errors import InputError, UnreadableFrameError, shown
 from tofuse.engine.frames.frames import Frame, RangeFrame
@@ -235,6 +235,25 @@ class Recording:
         except UnreadableFrameError:
             return None
         return frame if isinstance(frame, RangeFrame) else None
+
+    def origin(self, index: int) -> tuple[Source, int]:
+        """Return the source that a frame is from, if that here is made of others, and its index."""
+        source = self.source
+        while (origin := getattr(source, "origin", None)) is not None:
+            source, index = origin(index)
+        return source, index
+
+    def full_color(self, frame: RangeFrame) -> UInt8 | None:
+        """Return the colour of a frame as recorded, if it is finer than at the depth's size."""
+        source, index = self.origin(frame.index)
+        read = getattr(source, "full_resolution_color", None)
+        if read is None or frame.color_image is None:
+            return None
+        try:
+            image: UInt8 | None = read(index)
+        except InputError:
+            return None
+        return None if image is None or len(image) <= len(frame.color_image) else image
 
     def first_readable(self) -> Frame | None:
         """Return the first readable frame; None if there is none."""

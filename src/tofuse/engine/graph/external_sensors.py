@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from typing import Annotated, ClassVar, Protocol
 
 import numpy as np
@@ -39,6 +39,8 @@ _SPREAD = np.log(2.0)
 _BETTER = 0.5
 # Odometry that fewer fully constrained registrations were compared with is not verified.
 _MIN_COMPARED = 10
+# Devices jump rarely: if more of the steps are rejected, their errors are other ones than assumed.
+_MAX_REJECTED = 0.1
 # Squared disagreement, in units of tracking's errors, that one in a hundred motions of independent
 # odometry does not reach: if half of all don't, these errors are odometry's as well.
 _SHARED = float(chdtri(6, 0.99))
@@ -140,9 +142,10 @@ class SensorPriors:
         )
 
     @property
-    def is_continuous(self) -> bool:
-        """Whether no step of odometry was rejected, as where a device relocalizes."""
-        return all(r.used == r.measured for r in self.records if r.sensor == "odometry")
+    def is_reliable(self) -> bool:
+        """Whether few steps of odometry were rejected, as where a device relocalizes."""
+        odometry = [r for r in self.records if r.sensor == "odometry"]
+        return all(r.measured - r.used <= _MAX_REJECTED * r.measured for r in odometry)
 
     def with_depth_scale_at_least(self, least: tuple[float, float]) -> SensorPriors:
         """Return the measurements with a `depth_scale` of at least this."""
@@ -171,13 +174,21 @@ class SensorPriors:
         length = float(np.linalg.norm(up))
         return up / length if length > 0.1 else None
 
-    def witnessed(self, ids: Sequence[int]) -> Float64 | None:
-        """(N, 4, 4) T_first_frame of ascending frames by the witness; None if it has gaps."""
-        steps = _between(self.witness, ids)
-        if not steps or len(steps) < len(ids) - 1:
-            return None
-        motions = accumulate((step.T_i_j for step in steps), np.matmul, initial=np.eye(4))
-        return np.array(list(motions))
+    def witnessed(self, ids: Sequence[int]) -> list[tuple[Intp, Float64]]:
+        """Return the runs of ascending frames that the witness connects.
+
+        Their positions (K,) in `ids`, and their poses (K, 4, 4) in the first one's frame.
+        """
+        position = {index: k for k, index in enumerate(ids)}
+        runs: list[tuple[list[int], list[Float64]]] = []
+        for step in _between(self.witness, ids):
+            i, j = position[step.i], position[step.j]
+            if not runs or runs[-1][0][-1] != i:
+                runs.append(([i], [np.eye(4)]))
+            positions, poses = runs[-1]
+            positions.append(j)
+            poses.append(poses[-1] @ step.T_i_j)
+        return [(np.array(positions, np.intp), np.array(poses)) for positions, poses in runs]
 
     def between(self, ids: Sequence[int]) -> list[Measured]:
         """Relative poses of successive frames of `ids` (ascending) without gaps between them."""
@@ -290,28 +301,34 @@ class OdometryEdges(Bounded, ExternalSensor):
             return SensorPriors()
         measured = se3.inverse(sensed.odometry[first]) @ sensed.odometry[first + 1]
         variances = self._variances(measured, sensed.times[first + 1] - sensed.times[first])
-        compared = _compare(sensed, graph, variances, first)
-        scales = (
-            np.ones((2, 2))
-            if compared is None
-            else compared.scales((1.0, 1.0), (_BETTER, self.limit))
-        )
-        if scales is None:
-            text = (
-                f"the odometry differs from the tracked motion by more than {self.limit:g} times "
-                "its errors, so it was not used"
-            )
-            return SensorPriors(records=(SensorRecord("odometry", len(first), 0, None, text),))
-        odometry_scale = scales[1]
-        C = (variances * np.repeat(odometry_scale**2, 3))[:, :, None] * np.eye(6)
-        stated = (variances * np.repeat(np.maximum(odometry_scale, 1) ** 2, 3))[:, :, None]
         tracked = se3.inverse(graph.poses[first]) @ graph.poses[first + 1]
         tracking_covariance = _covariance_to_reference(graph)
-        chi2 = _squared(
-            se3.log(se3.inverse(tracked) @ measured),
-            stated * np.eye(6) + tracking_covariance[first] + tracking_covariance[first + 1],
-        )
-        used = chi2 <= self.gate
+        misfit = se3.log(se3.inverse(tracked) @ measured)
+        used = np.ones(len(first), bool)
+        # Then without the rejected steps: a jump is in all longer motions over it.
+        for _ in range(2):
+            compared = _compare(sensed, graph, variances[used], first[used])
+            found = (
+                np.ones((2, 2))
+                if compared is None
+                else compared.scales((1.0, 1.0), (_BETTER, self.limit))
+            )
+            if found is None:
+                text = (
+                    f"the odometry differs from the tracked motion by more than {self.limit:g} "
+                    "times its errors, so it was not used"
+                )
+                return SensorPriors(records=(SensorRecord("odometry", len(first), 0, None, text),))
+            scales, odometry_scale = found, found[1]
+            stated = (variances * np.repeat(np.maximum(odometry_scale, 1) ** 2, 3))[:, :, None]
+            chi2 = _squared(
+                misfit,
+                stated * np.eye(6) + tracking_covariance[first] + tracking_covariance[first + 1],
+            )
+            used = chi2 <= self.gate
+            if used.all() or not used.any():
+                break
+        C = (variances * np.repeat(odometry_scale**2, 3))[:, :, None] * np.eye(6)
         shared = compared is not None and compared.shares_errors
         if shared:  # it says something only where the depth says nothing
             used &= sensed.degenerate[first] | sensed.degenerate[first + 1]

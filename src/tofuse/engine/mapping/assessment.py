@@ -207,7 +207,7 @@ class Assessment:
         sensors = external_sensors.SensorPriors()
         accuracy, covariances = assessed(sensors, observed)
         by_images = accuracy
-        together = closed.sensors.verified and closed.sensors.is_continuous
+        together = closed.sensors.verified and closed.sensors.is_reliable
         if together:
             by_depth = covariances
             if refined.color:

@@ -10,8 +10,7 @@ import numpy as np
 
 from tofuse.engine.arrays import UInt8
 from tofuse.engine.color import ColorView
-from tofuse.engine.errors import InputError
-from tofuse.engine.frames import Frame, RangeFrame, Recording, Source
+from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import PoseGraph
 from tofuse.engine.sensor import Corrector
@@ -100,27 +99,11 @@ def full_image(
 
     Reduced to at most so many pixels.
     """
-    source, index = origin_of(recording.source, frame.index)
-    read = getattr(source, "full_resolution_color", None)
-    if read is None or frame.color_image is None:
-        return None
-    try:
-        image: UInt8 | None = read(index)
-    except InputError:
-        return None
-    if image is None or len(image) <= len(frame.color_image):
-        return None
-    if most_pixels is None:
+    image = recording.full_color(frame)
+    if image is None or most_pixels is None:
         return image
     step = int(np.ceil(np.sqrt(image.shape[0] * image.shape[1] / max(most_pixels, 1))))
     if step == 1:
         return image
     size = (image.shape[1] // step, image.shape[0] // step)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def origin_of(source: Source, index: int) -> tuple[Source, int]:
-    """Return the source and the index there of a frame of a source made of others."""
-    while (origin := getattr(source, "origin", None)) is not None:
-        source, index = origin(index)
-    return source, index

@@ -13,7 +13,7 @@ from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.frames import Frame, RangeFrame, Recording, evenly_spaced
 from tofuse.engine.fusion import display_surface, texture
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping.color_frames import full_image, origin_of
+from tofuse.engine.mapping.color_frames import full_image
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.sensor import CameraErrors
@@ -113,7 +113,7 @@ def make_texture(
 
 def _colored(recording: Recording) -> Bool:
     """Return which frames (M,) may have colour: phones record it less often than depth."""
-    origins = (origin_of(recording.source, k) for k in recording.indices.tolist())
+    origins = (recording.origin(k) for k in recording.indices.tolist())
     return np.array([getattr(s, "has_color", lambda _: True)(k) for s, k in origins], bool)
 
 

@@ -111,7 +111,8 @@ def has_rival(
         return False
     images = pair_agreement.Comparison.of(later, earlier)
     agreement = _agreement(images.at(own.T_world_source))
-    return any(_agreement(images.at(T)) > (1 - _EQUAL) * agreement for T in rivals)
+    least = agreement - _EQUAL * abs(agreement)  # it is negative where noise hides the pattern
+    return any(_agreement(images.at(T)) > least for T in rivals)
 
 
 def _score(found: projective.Aligned) -> float:

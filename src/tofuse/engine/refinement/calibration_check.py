@@ -371,14 +371,20 @@ class _Estimator:
 
         As of the gap of a loop, only a difference beyond noise counts.
         """
-        if self._witness is None:
+        if not self._witness:
             return False
         depth = float(np.median([view.depth for view in self._views]))
-        before, after = (
-            rms_motion(self._witness, se3.inverse(poses[0]) @ poses)
-            for poses in (self._poses, estimate.poses)
-        )
+        before, after = map(self._from_witness, (self._poses, estimate.poses))
         return Gap(0, len(self._poses) - 1, before, after, depth).widens
+
+    def _from_witness(self, poses: Float64) -> tuple[float, float]:
+        """Return the rms motion (m, rad) from odometry to poses, of each run of it on its own."""
+        squares = np.zeros(2)
+        for rows, witnessed in self._witness:
+            first = se3.inverse(poses[rows[0]])
+            squares += len(rows) * np.square(rms_motion(witnessed, first @ poses[rows]))
+        m, rad = np.sqrt(squares / sum(len(rows) for rows, _ in self._witness)).tolist()
+        return m, rad
 
     def support_of(self, estimate: AlignedViews) -> tuple[float, float]:
         """Mean support of the views without and with the errors of an estimate."""

@@ -36,14 +36,15 @@ class Priors:
     gravity
         Directions of gravity, or None.
     witness
-        (N, 4, 4) T_first_view of all views by odometry that the result is compared with, or None.
+        Odometry that the result is compared with: of each run of views without a gap their
+        positions (K,), and their poses (K, 4, 4) in the first one's frame.
     """
 
     pairs: Intp
     measured: Float64
     information: Float64
     gravity: external_sensors.Gravity | None = None
-    witness: Float64 | None = None
+    witness: Sequence[tuple[Intp, Float64]] = ()
 
     @classmethod
     def none(cls) -> Priors:

@@ -55,7 +55,8 @@ class CameraFile:
         Metres per count.
     depth_kind
         "z" or "range".
-    frame_rate_hz, ambiguity_m, confidence_max, amplitude_kind, sigma_unit_m, sensor, serial
+    frame_rate_hz, ambiguity_m, confidence_max, amplitude_kind, sigma_unit_m, sensor, serial,
+    poses_by
         See the native format in docs/formats.md; None where not given.
     color_registered
         Whether colour without its own camera is registered to depth.
@@ -76,6 +77,7 @@ class CameraFile:
     sigma_unit_m: float | None = None
     sensor: str | None = None
     serial: str | None = None
+    poses_by: str | None = None
     color_registered: bool = True
     color: ColorCamera | None = None
     unknown: tuple[str, ...] = ()
@@ -136,6 +138,7 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
         get.positive("sigma_unit_m"),
         get.text("sensor"),
         get.text("serial"),
+        get.text("poses_by"),
         get.flag("color_registered", default=True),
         color,
         tuple(key for key in data if key not in {"schema", *_LENS, *_KEYS}),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,9 +13,17 @@ import numpy as np
 from tofuse.engine.arrays import UInt8
 from tofuse.engine.cameras import Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError, UnreadableFrameError
-from tofuse.engine.frames import CloudFrame, Frame, RangeFrame, Recording, depth_counts
+from tofuse.engine.frames import (
+    NOISE_MODEL,
+    POSES_BY,
+    CloudFrame,
+    Frame,
+    RangeFrame,
+    Recording,
+    depth_counts,
+)
 from tofuse.engine.sensor import DepthCorrection
-from tofuse.formats.cameras import Rectifier, camera_file, pinhole_of
+from tofuse.formats.cameras import Rectifier, camera_file, pinhole_of, write_noise
 from tofuse.formats.files import atomic, staging
 from tofuse.formats.images import write_png
 from tofuse.formats.poses import write_log, write_tum
@@ -26,6 +33,7 @@ from tofuse.formats.recordings import RecordingWriter
 FINEST_UNIT_M = 1e-4
 MIN_SIGMA_UNIT_M = 1e-5
 _SAMPLED_FRAMES = 24
+_MAX_FRACTION = 0.05  # of a count, by the precision of float32
 _CHANNELS = ("amplitude_image", "confidence_image", "color_image")
 
 
@@ -41,8 +49,8 @@ class Conversion:
 def convert(recording: Recording, folder: str | Path) -> Conversion:
     """Write a recording as a native folder.
 
-    Depth keeps its unit, if the recording has one, and each frame its camera, if they differ. A
-    correction is stored with uncorrected depth. The folder appears when all is written.
+    Depth keeps its unit, if it is in whole counts of one, and each frame its camera, if they
+    differ. A correction is stored with uncorrected depth. The folder appears when all is written.
 
     Parameters
     ----------
@@ -64,6 +72,7 @@ def convert(recording: Recording, folder: str | Path) -> Conversion:
 
 
 def _write(recording: Recording, folder: Path) -> tuple[int, list[str]]:
+    _check_one_camera(recording)
     warnings: list[str] = []
     recording, correction = _uncorrected(recording)
     sample = recording.readable(_SAMPLED_FRAMES)
@@ -92,10 +101,18 @@ def _write(recording: Recording, folder: Path) -> tuple[int, list[str]]:
         warnings.append(f"{writer.out_of_range} values were too large for 16 bits")
     if any(isinstance(f, CloudFrame) and f.origin.any() for f in sample):
         warnings.append("the sensor's position within its clouds is lost")
-    noise = Path(recording.path) / "noise.json"
-    if noise.is_file():
-        shutil.copyfile(noise, folder / "noise.json")
+    if NOISE_MODEL in recording.metadata:
+        write_noise(folder / "noise.json", recording.metadata[NOISE_MODEL])
     return len(written), warnings
+
+
+def _check_one_camera(recording: Recording) -> None:
+    if "cameras" in recording.metadata:
+        raise InputError(
+            "is a rig, and a folder like this holds one camera",
+            where=recording.path,
+            remedy="convert its recordings one by one",
+        )
 
 
 def _uncorrected(recording: Recording) -> tuple[Recording, DepthCorrection | None]:
@@ -120,7 +137,8 @@ def _writer(
     metadata = recording.metadata
     first = sample[0]
     properties: dict[str, Any] = {
-        name: metadata.get(name) for name in ("frame_rate_hz", "confidence_max", "sensor", "serial")
+        name: metadata.get(name)
+        for name in ("frame_rate_hz", "confidence_max", "sensor", "serial", POSES_BY)
     }
     if isinstance(first, CloudFrame):
         return RecordingWriter(folder, None, **properties)
@@ -131,7 +149,7 @@ def _writer(
     if sigma_unit is None and sigmas:
         sigma_unit = max(MIN_SIGMA_UNIT_M, _round_up(max(sigmas) / depth_counts.MAX_COUNTS))
     unit = metadata.get("depth_unit_m")
-    if unit is None:
+    if unit is None or not all(_is_counted(f, unit) for f in images):
         farthest = max(float(f.depth.max()) for f in images)
         unit = max(FINEST_UNIT_M, _round_up(1.25 * farthest / depth_counts.MAX_COUNTS))
     if any(f.amplitude_image is not None for f in images):
@@ -147,6 +165,12 @@ def _writer(
         camera_per_frame=camera_per_frame,
         **properties,
     )
+
+
+def _is_counted(frame: RangeFrame, unit_m: float) -> bool:
+    """Whether depth is stored in counts of a unit: not as floats in it, such as metres."""
+    counts = frame.depth[frame.valid] / unit_m
+    return bool((np.abs(counts - np.rint(counts)) < _MAX_FRACTION).all())
 
 
 def _round_up(value: float) -> float:
@@ -248,6 +272,7 @@ def convert_to(recording: Recording, folder: str | Path, layout: Layout) -> Conv
 
 
 def _write_layout(recording: Recording, folder: Path, layout: Layout) -> tuple[int, list[str]]:
+    _check_one_camera(recording)
     warnings: list[str] = []
     color_folder = "rgb" if layout == "tum" else "color"
     rectifier: Rectifier | None = None

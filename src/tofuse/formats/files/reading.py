@@ -83,7 +83,7 @@ def path_of(value: object, name: str, remedy: str) -> Path:
     """
     if not isinstance(value, str | os.PathLike):
         raise InputError(f"is a {type(value).__name__}, not a path", where=name, remedy=remedy)
-    if "\0" in str(value):
+    if not str(value) or "\0" in str(value):
         raise InputError(f"is {str(value)!r}, not a path", where=name, remedy=remedy)
     return Path(value)
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from tofuse.formats.geometry.glb import read_textured_glb, write_glb, write_gltf
     from tofuse.formats.geometry.las import write_las
     from tofuse.formats.geometry.obj import write_obj
-    from tofuse.formats.geometry.pcd import Pcd, read_pcd, write_pcd
+    from tofuse.formats.geometry.pcd import read_pcd, unpacked_color, write_pcd
     from tofuse.formats.geometry.ply import read_ply, write_ply
     from tofuse.formats.geometry.surfaces import is_surface, read_surface, surface_points
     from tofuse.formats.geometry.usdz import write_usdz

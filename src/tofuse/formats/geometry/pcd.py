@@ -52,6 +52,11 @@ class Pcd:
         """Whether the points form an image."""
         return self.height > 1 and self.width > 1
 
+    @property
+    def image(self) -> NDArray[np.floating]:
+        """(H, W, 3) points of an organised cloud."""
+        return self.cloud.points.reshape(self.height, self.width, 3)
+
 
 @dataclass(frozen=True)
 class _Header:
@@ -96,7 +101,7 @@ def _parsed(data: bytes) -> Pcd:
     for name in "xyz":
         if fields[name].ndim != 1:
             raise InputError(f"has several values of {name!r} per point")
-    color = _unpacked_color(fields)
+    color = unpacked_color(fields)
     points = stacked(fields, ("x", "y", "z"))
     normals: Float32 | None = None
     if all(name in fields for name in _NORMALS):
@@ -105,8 +110,8 @@ def _parsed(data: bytes) -> Pcd:
     return Pcd(cloud, header.width, header.height, np.array(header.viewpoint, float))
 
 
-def _unpacked_color(fields: dict[str, NDArray[Any]]) -> UInt8 | None:
-    """Remove a packed rgb or rgba field, and return it as (N, 3)."""
+def unpacked_color(fields: dict[str, NDArray[Any]]) -> UInt8 | None:
+    """Remove a packed rgb or rgba field of PCL, and return it as (N, 3); None if there is none."""
     for name in ("rgb", "rgba"):
         packed = fields.get(name)
         if packed is not None and packed.ndim == 1 and packed.dtype.itemsize == 4:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.engine.times import associate
+from tofuse.engine.times import partners
 from tofuse.formats.files import atomic, reading, tables
 
 
@@ -173,9 +173,9 @@ def _finite_poses(poses: ArrayLike) -> Float64:
 def associated_poses(timestamps: ArrayLike, others: ArrayLike, poses: ArrayLike) -> Float64:
     """Return poses (N, 4, 4) at timestamps (N,), matched to (M,) others with (M, 4, 4) poses.
 
-    Timestamps without a match have NaN; see `associate`.
+    Timestamps without a match have NaN; see `times.partners`.
     """
-    pairs = associate(timestamps, others)
-    out = np.full((np.size(timestamps), 4, 4), np.nan)
-    out[pairs[:, 0]] = np.asarray(poses, float)[pairs[:, 1]]
+    index = partners(timestamps, others)
+    out = np.full((len(index), 4, 4), np.nan)
+    out[index >= 0] = np.asarray(poses, float)[index[index >= 0]]
     return out

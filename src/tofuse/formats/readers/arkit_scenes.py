@@ -11,7 +11,7 @@ from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.engine.times import nearest
+from tofuse.engine.times import partners
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading, tables
 from tofuse.formats.images import first_size
@@ -75,7 +75,7 @@ def _times(files: list[Path]) -> Float64:
 def _of_frames(folder: Path, suffix: str, times: Float64) -> list[Path | None]:
     """The file of each frame; None where there is none."""
     files = inputs.files_at(folder, suffix)
-    found = nearest(_times(files), times, _LIMIT_S)
+    found = partners(times, _times(files), _LIMIT_S)
     return [files[k] if k >= 0 else None for k in found]
 
 

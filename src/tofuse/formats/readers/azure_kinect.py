@@ -18,7 +18,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.engine.times import nearest
+from tofuse.engine.times import partners
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import as_color, matroska, parse_image
@@ -167,6 +167,10 @@ class AzureKinectSource(FileSource):
             )
         return np.frombuffer(data, ">u2").reshape(height, width).astype(np.uint16)
 
+    def has_color(self, index: int) -> bool:
+        """See `FileSource.has_color`."""
+        return self.color[index] is not None
+
     def _color_image(self, index: int, frame: RangeFrame) -> UInt8 | None:
         block = self.color[index]
         if block is None or self.color_camera is None:
@@ -186,7 +190,7 @@ class AzureKinectSource(FileSource):
             return [None] * len(self.depth)
         depth_times = np.array([b.time_ns - delay for b in self.depth]) / 1e9
         times = np.array([b.time_ns for b in track.blocks]) / 1e9
-        pairs = nearest(times, depth_times, limit)
+        pairs = partners(depth_times, times, limit)
         if (pairs < 0).any():
             self.warnings.append(
                 f"{int((pairs < 0).sum())} of {len(pairs)} frames have no {track.name} image"

@@ -15,7 +15,7 @@ from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
 from tofuse.formats.files import reading, tables
-from tofuse.formats.geometry import Pcd, read_pcd
+from tofuse.formats.geometry import read_pcd
 from tofuse.formats.sources import cloud_files, inputs, organised
 
 
@@ -57,7 +57,9 @@ def pcd_cloud(path: Path, index: int, timestamp: float) -> CloudFrame:
 def pcd_image(path: Path, index: int, timestamp: float, camera: Camera) -> Frame:
     """Read an organised file as an image of `camera`; see `organised_frame`."""
     pcd = read_pcd(path)
-    return organised.organised_frame(_image(pcd), pcd.cloud, camera, index, timestamp)
+    return organised.organised_frame(
+        cloud_files.to_float32(pcd.image), pcd.cloud, camera, index, timestamp
+    )
 
 
 def _camera(files: list[Path]) -> Camera | None:
@@ -66,7 +68,7 @@ def _camera(files: list[Path]) -> Camera | None:
     for file, pcd in organised.samples(len(files), lambda k: (files[k], read_pcd(files[k]))):
         if not pcd.organised or pcd.viewpoint[:3].any():
             return None
-        images.append(_image(pcd))
+        images.append(cloud_files.to_float32(pcd.image))
         points, size = images[-1].reshape(-1, 3), f"WIDTH {pcd.width} and HEIGHT {pcd.height}"
         fits, fits_turned = (organised.find_raster(points, n) for n in (pcd.width, pcd.height))
         if fits is None and fits_turned is not None:
@@ -76,10 +78,6 @@ def _camera(files: list[Path]) -> Camera | None:
                 remedy="swap WIDTH and HEIGHT",
             )
     return organised.common_camera(images)
-
-
-def _image(pcd: Pcd) -> Float32:
-    return cloud_files.to_float32(pcd.cloud.points).reshape(pcd.height, pcd.width, 3)
 
 
 _SUFFIXES = (".xyz", ".xyzn", ".xyzrgb", ".asc", ".pts")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import Frame, depth_counts
+from tofuse.engine.frames import POSES_BY, Frame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.engine.sensor import DepthCorrection
 from tofuse.formats.cameras import camera_file, corrected_depth, read_correction
@@ -283,7 +283,13 @@ class NativeSource(FileSource):
                 f"{', '.join(description.unknown)}"
             )
         self.metadata |= description.stated(
-            "sensor", "serial", "frame_rate_hz", "ambiguity_m", "confidence_max", "amplitude_kind"
+            "sensor",
+            "serial",
+            "frame_rate_hz",
+            "ambiguity_m",
+            "confidence_max",
+            "amplitude_kind",
+            POSES_BY,
         )
         if self.camera is not None:
             self.metadata["depth_unit_m"] = description.depth_unit_m

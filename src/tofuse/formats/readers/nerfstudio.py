@@ -105,6 +105,10 @@ class NerfstudioSource(FileSource):
         path = self.frames[index].image()
         return None if path is None else read_color(path)
 
+    def has_color(self, index: int) -> bool:
+        """See `FileSource.has_color`."""
+        return self.frames[index].image() is not None
+
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
         frame = self.frames[index]

@@ -12,7 +12,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.engine.times import nearest
+from tofuse.engine.times import partners
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import first_size
@@ -26,6 +26,7 @@ PRIMESENSE = Pinhole(*SIZE, 525.0, 525.0, 319.5, 239.5)
 _COLOR_FOLDERS = ("color", "image", "rgb")
 COLOR_LIMIT_S = 0.05
 _MICROSECONDS = re.compile(r"[0-9]+-([0-9]{12})")
+_NUMBER = re.compile(r"[^0-9]*([0-9]{1,18})(?:-[0-9]+)?")
 
 
 @part("reader", "redwood", label="validated")
@@ -37,11 +38,11 @@ class Redwood(Reader):
         if not reading.is_folder(path / "depth") or reading.is_file(path / "depth.txt"):
             return None
         color = next((n for n in _COLOR_FOLDERS if reading.is_folder(path / n)), None)
-        if color is None:
-            return None
         camera = _camera_file(path)
+        if color is None and (camera is None or reading.is_file(path / "camera.json")):
+            return None
         if camera is not None:
-            return Sniff(1.0, f"depth/, {color}/ and {camera.name}")
+            return Sniff(1.0, f"depth/{'' if color is None else f', {color}/'} and {camera.name}")
         if reading.is_file(path / "trajectory.log"):
             return Sniff(1.0, f"depth/, {color}/ and trajectory.log")
         if reading.is_file(path / "camera.json"):
@@ -154,14 +155,16 @@ def color_files(
     color = color_images(folder)
     color_times = timestamps(color)
     if times is not None and color_times is not None:
-        found = nearest(color_times, times, COLOR_LIMIT_S)
+        found = partners(times, color_times, COLOR_LIMIT_S)
         matches = [color[k] if k >= 0 else None for k in found]
-    elif len(color) == len(files):
-        return list(color)
     else:
         named = {file.stem: file for file in color}
         numbered = {_number(file): file for file in color if _number(file) is not None}
         matches = [named.get(f.stem) or numbered.get(_number(f)) for f in files]
+        # Of as many images of another first number, or of names that tell nothing.
+        alike = len(color) == len(files)
+        if alike and (_numbered_alike(color, files) or matches.count(None) > len(files) // 2):
+            return list(color)
     if any(matches):
         return matches
     warnings.append(
@@ -177,9 +180,15 @@ def color_images(folder: Path) -> list[Path]:
 
 
 def _number(path: Path) -> int | None:
-    """Number of an image: the prefix of its name."""
-    first = path.stem.split("-")[0]
-    return int(first) if first.isdecimal() and len(first) <= 18 else None
+    """Number of an image: of names like 000012-000000400428 or color_000012."""
+    match = _NUMBER.fullmatch(path.stem)
+    return int(match.group(1)) if match else None
+
+
+def _numbered_alike(color: list[Path], files: list[Path]) -> bool:
+    """Whether the numbers of colour images are those of as many depth images, plus a constant."""
+    pairs = [(_number(c), _number(f)) for c, f in zip(color, files, strict=True)]
+    return len({c - f for c, f in pairs if c is not None and f is not None}) == 1
 
 
 def _poses(path: Path, count: int) -> Float64:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from contextlib import suppress
+from os.path import commonprefix
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +156,7 @@ class RosSource(bags.BagSource):
             self.color_camera = None  # the bag's own is found below
             return
         infos = [c for c in self.bag.connections if c.msgtype == INFO]
+        infos = _alike_first(infos, self.connection)
         adjacent = self._camera_infos(self.connection)
         candidates = (
             adjacent or [c for c in infos if "depth" in c.topic] or infos[: len(infos) == 1]
@@ -168,13 +170,17 @@ class RosSource(bags.BagSource):
         self.camera = self._lens_of(candidates[0], self.connection)
 
     def _camera_infos(self, connection: Any) -> list[Any]:
-        """The CameraInfo connections in the namespace of an image connection."""
+        """The CameraInfo connections in the namespace of an image connection, of like names first.
+
+        As in /camera/depth and /camera, or /depth_image, /color_camera_info, /depth_camera_info.
+        """
         folder = connection.topic.rsplit("/", 1)[0]
-        return [
+        found = [
             c
             for c in self.bag.connections
             if c.msgtype == INFO and c.topic.rsplit("/", 1)[0] in (folder, folder.rsplit("/", 1)[0])
         ]
+        return _alike_first(found, connection)
 
     def _transforms(self) -> bags.Transforms:
         try:
@@ -212,7 +218,8 @@ class RosSource(bags.BagSource):
     def _find_color(self, transforms: bags.Transforms) -> None:
         """Find a colour camera with known intrinsics and pose relative to depth."""
         missing: list[str] = []
-        for connection in sorted(self.bag.connections, key=lambda c: (c.msgtype, c.topic)):
+        connections = sorted(self.bag.connections, key=lambda c: (c.msgtype, c.topic))
+        for connection in _alike_first(connections, self.connection):
             if not self._is_color(connection) or not len(track := bags.Track(self.bag, connection)):
                 continue
             try:
@@ -250,7 +257,7 @@ class RosSource(bags.BagSource):
         return True
 
     def _is_color(self, connection: Any) -> bool:
-        topic = connection.topic.lower()
+        topic = connection.topic.lower().replace("to_depth", "")  # registered to it
         if "depth" in topic or not any(keyword in topic for keyword in _COLOR_KEYWORDS):
             return False
         if connection.msgtype == COMPRESSED:
@@ -268,7 +275,8 @@ class RosSource(bags.BagSource):
 
     def _find_amplitude(self) -> bags.Track | None:
         """The amplitude track of the same sensor: its images match the depth's size and times."""
-        for connection in sorted(self.bag.connections, key=lambda c: c.topic):
+        connections = sorted(self.bag.connections, key=lambda c: c.topic)
+        for connection in _alike_first(connections, self.connection):
             is_named = any(keyword in connection.topic.lower() for keyword in _AMPLITUDE_KEYWORDS)
             if connection.msgtype != IMAGE or connection.topic == self.connection.topic:
                 continue
@@ -298,6 +306,11 @@ class RosSource(bags.BagSource):
                     return None
                 images.append(points.reshape(message.height, message.width, 3))
         return organised.common_camera(images)
+
+
+def _alike_first(connections: list[Any], other: Any) -> list[Any]:
+    """Connections sorted by how much of its name their topic begins with: those of one camera."""
+    return sorted(connections, key=lambda c: -len(commonprefix((c.topic, other.topic))))  # noqa: RUF071
 
 
 def _rank(connection: Any) -> int | None:

@@ -12,7 +12,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import BrownConrady, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
-from tofuse.engine.times import nearest
+from tofuse.engine.times import partners
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading, tables
 from tofuse.formats.images import first_size
@@ -74,8 +74,7 @@ class Tum(Reader):
         color: list[Path | None] | None = None
         if len(lists) > 1:
             color_times, color_files = lists[1]
-            # A depth image without a colour image takes that of a neighbour: only for display.
-            pairs = nearest(color_times, times, COLOR_LIMIT_S)
+            pairs = partners(times, color_times, COLOR_LIMIT_S)
             if (pairs >= 0).any():
                 exists = [reading.is_file(file) for file in color_files]
                 color = [color_files[k] if k >= 0 and exists[k] else None for k in pairs]

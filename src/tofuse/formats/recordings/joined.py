@@ -13,7 +13,7 @@ from tofuse.engine.frames import Frame, RangeFrame, Source
 
 
 class JoinedSource:
-    """Several sources in sequence."""
+    """Several sources in sequence, which may be joined themselves."""
 
     def __init__(self, parts: Sequence[Source], names: Sequence[str]) -> None:
         self.parts = list(parts)
@@ -34,7 +34,9 @@ class JoinedSource:
                 if key in part.metadata and part.metadata[key] == value
             }
         self.metadata["parts"] = [
-            {"name": name, "frames": count} for name, count in zip(names, counts, strict=True)
+            part
+            for source, name, count in zip(self.parts, names, counts, strict=True)
+            for part in _parts(source, name, count)
         ]
 
     @property
@@ -66,6 +68,14 @@ class JoinedSource:
         part, index_there = self.origin(index)
         frame = part.read(index_there)
         return replace(frame, index=index, timestamp=float(self.timestamps[index]))
+
+
+def _parts(source: Source, name: str, count: int) -> list[dict[str, Any]]:
+    """The name and the number of frames of each recording that a source consists of."""
+    parts = source.metadata.get("parts")
+    if parts is None:
+        return [{"name": name, "frames": count}]
+    return [part | {"name": f"{name}, {part['name']}"} for part in parts]
 
 
 def _joined_warnings(parts: Sequence[Source], names: Sequence[str]) -> list[str]:

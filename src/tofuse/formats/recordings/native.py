@@ -46,7 +46,7 @@ class RecordingWriter:
         Metres per count.
     depth_kind
         Kind of the stored depth, "z" or "range"; frames are converted.
-    frame_rate_hz, ambiguity_m, confidence_max, amplitude_kind, sensor
+    frame_rate_hz, ambiguity_m, confidence_max, amplitude_kind, sensor, serial, poses_by
         See `CameraFile`; None: not written.
     sigma_unit_m
         Metres per count of sigma; None: frames' sigma is not written.
@@ -81,6 +81,7 @@ class RecordingWriter:
         amplitude_kind: str | None = None,
         sensor: str | None = None,
         serial: str | None = None,
+        poses_by: str | None = None,
         sigma_unit_m: float | None = None,
         color_registered: bool = True,
         camera_per_frame: bool = False,
@@ -106,6 +107,7 @@ class RecordingWriter:
             "amplitude_kind": amplitude_kind,
             "sensor": sensor,
             "serial": serial,
+            "poses_by": poses_by,
             "sigma_unit_m": sigma_unit_m,
             "color_registered": None if color_registered else False,
         }

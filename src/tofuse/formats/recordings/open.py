@@ -75,7 +75,7 @@ def open_recording(
         Files, folders or .zip files of these; several are joined in the order given. A folder of
         native or SR4000 recordings is joined in name order; if it contains a rig.json, its
         recordings are the cameras of a rig, one image of each in turn. A folder with a single
-        recording in it stands for that.
+        recording or folder in it stands for that.
     format
         Name of a reader, instead of detection.
     camera
@@ -109,14 +109,13 @@ def open_recording(
     for path in inner:
         _check_kind(path)
     located = [item for path in inner for item in _resolve(path, format)]
-    sources = [item.reader.open(item.path, options) for item in located]
+    sources = [_opened(item, options) for item in located]
     source: Source = sources[0]
     if len(sources) > 1:
         source = JoinedSource(sources, _short_names([item.path for item in located]))
     _check_usable(source, paths[0])
-    noise_file = (located[0].path if len(located) == 1 else inner[0]) / "noise.json"
-    if len(paths) == 1 and reading.is_folder(noise_file.parent) and reading.is_file(noise_file):
-        source.metadata[NOISE_MODEL] = read_noise(noise_file)
+    if len(inner) == 1:
+        _read_noise(source, inner[0])
     if min_depth is not None or max_depth is not None:
         source = LimitedSource(
             source, min_depth or 0.0, float("inf") if max_depth is None else max_depth
@@ -142,7 +141,7 @@ def _rig_source(
         located = _resolve(path, format)
         if len(located) > 1:
             raise InputError("contains several recordings", where=path, remedy="leave one")
-        source = located[0].reader.open(located[0].path, options)
+        source = _opened(located[0], options)
         _check_usable(source, path)
         recordings.append(Recording.of(source, path, name_of(located[0].reader)))
     return RigSource(read_rig(rig_file), recordings)
@@ -152,6 +151,19 @@ def _rig_source(
 class _Located:
     path: Path
     reader: Reader
+
+
+def _opened(item: _Located, options: ReaderOptions) -> Source:
+    source = item.reader.open(item.path, options)
+    _read_noise(source, item.path)
+    return source
+
+
+def _read_noise(source: Source, folder: Path) -> None:
+    """Read the noise.json of a folder, if it has one."""
+    file = folder / "noise.json"
+    if reading.is_folder(folder) and reading.is_file(file):
+        source.metadata[NOISE_MODEL] = read_noise(file)
 
 
 def _check_kind(path: Path) -> None:
@@ -205,6 +217,8 @@ def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
         )
     if not sniffs and (parts := _recordings_in(path)):
         return parts
+    if not sniffs and len(children) == 1 and reading.is_folder(children[0]):
+        return _resolve(children[0], format)
     suffixes = {p.suffix.lower() for p in (children or [path]) if p.is_file()}
     if suffixes and suffixes <= _ARCHIVES:
         raise InputError(
@@ -421,7 +435,8 @@ class Opening(OpeningOptions):
         Fields without an option keep their defaults.
         """
         names = [f.name for f in fields(cls) if hasattr(options, f.name)]
-        return cls(tuple(map(Path, inputs)), **{name: getattr(options, name) for name in names})
+        paths = tuple(reading.path_of(path, "path", "pass a recording") for path in inputs)
+        return cls(paths, **{name: getattr(options, name) for name in names})
 
     @property
     def source(self) -> tuple[object, ...]:

@@ -8,20 +8,23 @@ import tempfile
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float32, Float64, UInt8
+from tofuse.engine.arrays import Float32, Float64, Intp, UInt8
 from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, depth_counts
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import quaternion, se3
+from tofuse.engine.times import partners
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
+from tofuse.formats.geometry import unpacked_color
 from tofuse.formats.images import as_color, parse_image
 from tofuse.formats.sources.file_source import FileSource
 from tofuse.formats.sources.pixels import finite_float32, sampled_color
@@ -115,13 +118,16 @@ class Track:
     Attributes
     ----------
     connection
-        The connection of rosbags, with ``topic`` and ``msgtype``.
+        A connection of rosbags, with ``topic`` and ``msgtype``. A topic has another one for each
+        publisher, such as for a driver that was restarted.
     times
         (N,) s, from the message headers, or else of their arrival.
     """
 
     def __init__(self, bag: Any, connection: Any) -> None:
         self.bag, self.connection = bag, connection
+        kind = (connection.topic, connection.msgtype)
+        self._connections = [c for c in bag.connections if (c.topic, c.msgtype) == kind]
         times_of_messages = [
             (t, header_time(raw, getattr(bag, "is2", False))) for _, t, raw in self._messages()
         ]
@@ -166,7 +172,7 @@ class Track:
 
     def _messages(self, start: int | None = None) -> Iterator[tuple[Any, int, Any]]:
         messages: Iterator[tuple[Any, int, Any]] = self.bag.messages(
-            connections=[self.connection], start=start
+            connections=self._connections, start=start
         )
         return messages
 
@@ -219,10 +225,10 @@ class BagSource(FileSource):
         time = float(self.timestamps[index])
         depth = self.read_depth(index, where)
         frame = self.image(index, depth, amplitude_image=self._amplitude_at(time, where))
-        k = None if self.color is None else self.color.nearest(time, MAX_GAP_S)
-        if self.color is None or k is None:
+        message = self._color_messages[index]
+        if self.color is None or message < 0:
             return frame
-        track, message, where = self.color, k, f"{where}, colour"
+        track, where = self.color, f"{where}, colour"
 
         def read_color() -> UInt8:
             with reading.library_errors(where, REMEDY):
@@ -230,6 +236,16 @@ class BagSource(FileSource):
             return sampled_color(frame, color, self.color_camera, where)
 
         return replace(frame, color_image=self.color_if_readable(index, read_color))
+
+    def has_color(self, index: int) -> bool:
+        """See `FileSource.has_color`."""
+        return bool(self._color_messages[index] >= 0)
+
+    @cached_property
+    def _color_messages(self) -> Intp:
+        """The message (N,) with the colour of each frame, or -1."""
+        times = () if self.color is None else self.color.times
+        return partners(self.timestamps, times, MAX_GAP_S)
 
     def read_depth(self, index: int, where: str) -> Float32:
         """Return the depth (H, W) of a frame in m."""
@@ -444,7 +460,7 @@ def lens(message: Any, where: str, *, rectified: bool = False) -> Pinhole:
 
 
 def cloud(message: Any, where: str) -> GeometryRecord:
-    """Read points and amplitude of a PointCloud2.
+    """Read points, amplitude and colour of a PointCloud2.
 
     Raises
     ------
@@ -456,11 +472,14 @@ def cloud(message: Any, where: str) -> GeometryRecord:
     missing = [name for name in "xyz" if name not in fields]
     if missing:
         raise InputError(f"has no field {missing[0]!r}", where=where, remedy="record x, y and z")
-    count, step = int(message.width) * int(message.height), int(message.point_step)
-    data = np.frombuffer(message.data, np.uint8)
-    if step < 1 or count * step > len(data):
+    width, height, step = int(message.width), int(message.height), int(message.point_step)
+    data, row = np.frombuffer(message.data, np.uint8), width * step
+    if step < 1 or height * row > len(data):
         raise InputError("is cut off", where=where, remedy="check the bag")
-    rows = data[: count * step].reshape(count, step)
+    # Rows may be padded; not all drivers state their length.
+    stated = int(message.row_step)
+    stride = stated if row < stated <= len(data) // max(height, 1) else row
+    rows = data[: height * stride].reshape(height, stride)[:, :row].reshape(-1, step)
 
     def column(name: str) -> NDArray[Any]:
         field = fields[name]
@@ -476,7 +495,8 @@ def cloud(message: Any, where: str) -> GeometryRecord:
         points = np.stack(xyz, 1).astype(np.result_type(np.float32, *(c.dtype for c in xyz)))
     amplitude = next((name for name in _AMPLITUDES if name in fields), None)
     scalars = {} if amplitude is None else {"amplitude": column(amplitude)}
-    return GeometryRecord(points, scalars=scalars)
+    color = unpacked_color({name: column(name) for name in ("rgb", "rgba") if name in fields})
+    return GeometryRecord(points, color=color, scalars=scalars)
 
 
 _ROS2_TYPE = "tf2_msgs/msg/TFMessage"
@@ -491,7 +511,8 @@ _MAX_DEPTH = 64
 class _Edge:
     """The pose of a frame in its parent: T_parent_child (N, 4, 4) at ascending times (N,).
 
-    If `static`, the last one applies at all times.
+    If `static`, the last one applies at all times. Early publishers of static transforms repeat
+    them on /tf.
     """
 
     parent: str
@@ -611,4 +632,5 @@ def _edge(rows: Sequence[tuple[float, str, Float64]], static: bool) -> _Edge:
     times = np.array([row[0] for row in rows])
     T = np.array([row[2] for row in rows])
     is_last = np.append(np.diff(times) > 0, True)
+    static |= len(T) > 1 and bool((T[0] == T).all())
     return _Edge(parent, times[is_last], T[is_last], static)

@@ -232,6 +232,10 @@ class DepthImageSource(FileSource):
             color_registered=self.color_registered or self.color_camera is not None,
         )
 
+    def has_color(self, index: int) -> bool:
+        """See `FileSource.has_color`."""
+        return self.color is not None and self.color[index] is not None
+
     def read_counts(self, index: int, size: tuple[int, int]) -> UInt16:
         """Return the image (H, W) of a frame, in counts of depth."""
         return read_image(self.files[index], size=size, dtype="uint16")
