@@ -300,6 +300,8 @@ def test_the_unit_of_a_file_is_recognised() -> None:
     _, reference, said = in_metres(nominal, in_mm, "mm")
     np.testing.assert_allclose(reference.points, nominal.points)
     assert said == ""
+    in_inches = replace(nominal, points=nominal.points / 0.0254)
+    np.testing.assert_allclose(in_metres(nominal, in_inches, "in")[1].points, nominal.points)
     assert in_metres(nominal, nominal)[2] == ""
 
 

@@ -21,7 +21,7 @@ from tofuse.engine.results import Reconstruction
 from tofuse.formats.files import reading
 from tofuse.formats.geometry import is_surface, read_surface
 
-UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 # Files in mm and models in m differ by 1000 in extent; a part and the room around it by less.
 _MIN_MM_RATIO = 30.0
 _MIN_POINTS = 50
