@@ -14,7 +14,7 @@ from tofuse.apps.compare import deviations as module
 from tofuse.apps.compare.comparing import _regions, compared
 from tofuse.apps.compare.deviations import COVERAGE
 from tofuse.apps.compare.nearest import Reach, Reference
-from tofuse.apps.compare.surface import Surface, in_metres
+from tofuse.apps.compare.surface import Surface, in_metres, surface_of
 from tofuse.apps.pairs import register
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
@@ -137,6 +137,57 @@ def test_surface_that_a_solid_lacks_does_not_pass(part) -> None:
     assert "% has no counterpart in it." in found.sentence
 
 
+@pytest.mark.parametrize(
+    ("shift", "verdict"), [(0.0, "pass"), (0.001, "pass"), (0.005, "undecided")]
+)
+def test_a_hole_that_is_elsewhere_does_not_pass(shift, verdict) -> None:
+    """Of a thin plate, seen from above at points of 2 mm, which says nothing of the walls."""
+    half = np.array([0.1, 0.07])
+    strips = [meshes.box([0.09, 0.14, 0.006], [side * 0.055, 0, 0]) for side in (-1, 1)] + [
+        meshes.box([0.02, 0.06, 0.006], [0, side * 0.04, 0]) for side in (-1, 1)
+    ]
+    x, y = np.mgrid[-half[0] : half[0] : 0.002, -half[1] : half[1] : 0.002].reshape(2, -1) + 1e-3
+    at = (np.abs(x - shift) > 0.01) | (np.abs(y) > 0.01)
+    z = 0.003 + np.random.default_rng(0).normal(0, 1e-4, at.sum())
+    points = np.column_stack([x[at], y[at], z])
+    up = np.tile([0.0, 0, 1], (len(points), 1))
+    measured = Surface("scan", points, up, None, True, np.full(len(points), 1e-4), 1e-4)
+    found = compared(measured, Reference.of(drawn(*strips)), 0.002, searched=False)
+    assert found.verdict == verdict
+    if shift > 0.002:
+        (more,) = found.deviations.unmatched
+        np.testing.assert_allclose(more.centre_m, [-0.0075, 0, 0.003], atol=0.002)
+        assert 0.002 < more.distance_m < 0.007
+
+
+def test_a_block_that_is_missing_does_not_pass(part) -> None:
+    """The plate is drawn below it, too: what was measured there deviates from nothing."""
+    calm = scan(Reference.of(drawn(meshes.box([0.2, 0.14, 0.05]))))
+    x, y = np.mgrid[0.017:0.064:0.002, -0.017:0.058:0.002].reshape(2, -1)
+    floor = np.column_stack([x, y, np.full(len(x), 0.025)])
+    measured = replace(
+        calm,
+        points=np.concatenate([calm.points, floor]),
+        normals=np.concatenate([calm.normals, np.tile([0.0, 0, 1], (len(floor), 1))]),
+        sigma=np.full(len(calm.points) + len(floor), NOISE),
+        eyes=np.array([[0.0, 0, 1], [0.1, 0.5, 0.5]]),
+    )
+    found = compared(measured, part, 0.002, searched=False)
+    assert found.verdict == "undecided"
+    (floor_of_block,) = found.deviations.unmatched
+    np.testing.assert_allclose(floor_of_block.centre_m, [0.04, 0.02, 0.025], atol=0.005)
+    assert 0.01 < floor_of_block.distance_m < 0.07
+    # Of a file it is not known what its cameras saw through.
+    unknown = replace(measured, eyes=np.zeros((0, 3)))
+    assert compared(unknown, part, 0.002, searched=False).verdict == "pass"
+
+
+def test_cameras_of_a_result_are_known(room_result) -> None:
+    result = tofuse.load(room_result)
+    eyes = surface_of(result).eyes
+    np.testing.assert_array_equal(eyes, result.trajectory[result.has_pose, :3, 3] + result.shift)
+
+
 def test_a_solid_is_recognised(part) -> None:
     assert part.is_solid
     box = drawn(meshes.box([0.2, 0.14, 0.05]))
@@ -249,6 +300,8 @@ def test_the_unit_of_a_file_is_recognised() -> None:
     _, reference, said = in_metres(nominal, in_mm, "mm")
     np.testing.assert_allclose(reference.points, nominal.points)
     assert said == ""
+    in_inches = replace(nominal, points=nominal.points / 0.0254)
+    np.testing.assert_allclose(in_metres(nominal, in_inches, "in")[1].points, nominal.points)
     assert in_metres(nominal, nominal)[2] == ""
 
 

@@ -498,7 +498,7 @@ class Compare(Written, Json, Threads, Edited):
     tolerance: Length | None = None
     accuracy: Length | None = None
     guess: Path | None = None
-    unit: Literal["mm", "cm", "m"] | None = None
+    unit: Literal["mm", "cm", "m", "in"] | None = None
 
 
 class Repeat(Written, Json, Threads, Edited):

@@ -273,7 +273,7 @@ def compare(
     tolerance_m: float | None = None,
     guess: ArrayLike | None = None,
     accuracy_m: float | None = None,
-    unit: Literal["mm", "cm", "m"] | None = None,
+    unit: Literal["mm", "cm", "m", "in"] | None = None,
 ) -> Comparison:
     """Compare a result with a CAD model, a mesh, a cloud or another result.
 

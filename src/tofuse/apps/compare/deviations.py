@@ -312,11 +312,11 @@ def mapped(
     row = np.maximum(label, 0)
     of_points[compared] = np.where(label < 0, np.nan, np.hypot(sigma, places.sigma[row]))
     deviation[compared[label < 0]] = np.nan
-    # Rounding moves a surface at an edge by less than half of the width that it is left out for.
-    limit = (tolerance_m or 0.0) + 0.5 * _EDGE_SPACINGS * spacing + _CUT_SIGMAS * shared_m
+    noise = _CUT_SIGMAS * float(np.hypot(shared_m, np.median(sigma)))
     lacking = unmatched(
-        reference, points, normals, found.compared, measured.oriented, size, spacing, limit
-    )
+        reference, points, normals, found, measured.oriented, size, spacing,
+        tolerance_m or 0.0, noise, se3.transform(T, measured.eyes),
+    )  # fmt: skip
     return DeviationMap(
         T, points, normals, deviation, of_points, place, places, seen, left_out, free, scale,
         beyond, lacking,

@@ -43,7 +43,7 @@ class CompareOptions(folders.OutputOptions):
     tolerance: float | None = None
     guess: Path | None = None
     accuracy: float | None = None
-    unit: Literal["mm", "cm", "m"] | None = None
+    unit: Literal["mm", "cm", "m", "in"] | None = None
     threads: int | None = None
 
 

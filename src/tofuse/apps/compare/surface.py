@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -21,7 +21,7 @@ from tofuse.engine.results import Reconstruction
 from tofuse.formats.files import reading
 from tofuse.formats.geometry import is_surface, read_surface
 
-UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 # Files in mm and models in m differ by 1000 in extent; a part and the room around it by less.
 _MIN_MM_RATIO = 30.0
 _MIN_POINTS = 50
@@ -53,6 +53,8 @@ class Surface:
         Whether it is a result, whose unit is known.
     unit
         Unit of its file.
+    eyes
+        (E, 3) m, where the cameras were; none where not known.
     """
 
     name: str
@@ -64,6 +66,7 @@ class Surface:
     shared_m: float | None = None
     is_result: bool = False
     unit: str = "m"
+    eyes: Float64 = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def extent(self) -> float:
@@ -108,7 +111,8 @@ def surface_of(given: Comparable, name: str = "") -> Surface:
 def _of_result(result: Reconstruction, name: str) -> Surface:
     model = result.cloud if result.mesh is None or not len(result.mesh) else result.mesh
     surface = _of_record(model.record().shifted(result.shift), name)
-    return replace(surface, shared_m=_shared_sigma(result), is_result=True)
+    eyes = result.trajectory[result.has_pose, :3, 3] + result.shift
+    return replace(surface, shared_m=_shared_sigma(result), is_result=True, eyes=eyes)
 
 
 def _shared_sigma(result: Reconstruction) -> float:
