@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import NoReturn
 
+from tofuse.apps.cli import values
 from tofuse.apps.cli.parser import Parser, make_parser
 from tofuse.engine.errors import InputError
 
@@ -66,9 +67,9 @@ def run_arguments(cells: Mapping[str, str], base: Path, where: str) -> tuple[str
                 raise InputError(f"{column} is {value!r}", where=where, remedy="use yes or no")
             arguments += [f"--{name}"] * (value.lower() in _YES)
         else:
-            path = action.type is Path
+            is_path = action.type is values.path
             arguments.append(
-                f"--{name}={os.path.join(base, os.path.expanduser(value)) if path else value}"
+                f"--{name}={os.path.join(base, os.path.expanduser(value)) if is_path else value}"
             )
     if problem := _problem(tuple(arguments)):
         raise InputError(problem, where=where)

@@ -27,11 +27,11 @@ def reader(kind: type, extra: object) -> Callable[[str], Any]:
     if callable(extra):
         return extra
     if kind is Path:
-        return _path
+        return path
     return (lambda text: _number(text, kind)) if kind in (int, float) else kind
 
 
-def _path(text: str) -> Path:
+def path(text: str) -> Path:
     """Read a path; an empty one, as of a shell variable that is not set, is no current folder."""
     if not text:
         raise argparse.ArgumentTypeError("'' is not a path")
