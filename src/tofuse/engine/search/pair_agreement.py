@@ -287,4 +287,4 @@ def landing_pixels(view: PreparedView, points: Float64) -> Intp:
     """Return column and row (N, 2) of the pixels that points (N, 3) project to; -1 outside."""
     z = np.where(points[:, 2] > 1e-3, points[:, 2], np.nan)
     pixels = view.projection.pixels(points[:, :2] / z[:, None])
-    return np.nan_to_num(pixels.round(), nan=-1).astype(np.intp)
+    return np.where(np.isnan(pixels), -1, np.rint(pixels)).astype(np.intp)
