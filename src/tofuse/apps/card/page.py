@@ -9,7 +9,8 @@ import numpy as np
 
 from tofuse.apps.card.collecting import date
 from tofuse.apps.card.making import QUANTITIES, SIGNIFICANCE, Card, dates, series
-from tofuse.apps.report import html, words
+from tofuse.apps.report import html
+from tofuse.engine import quantities
 from tofuse.engine.normal import OF_95_PERCENT
 
 # Of the drawing of a quantity, in its units.
@@ -43,7 +44,7 @@ def write_page(card: Card, path: Path) -> None:
         ],
         plots=[_plot(card, name) for name in card.drifts],
         noise=_noise(card),
-        ranges=[words.length(r) for r in _RANGES_M],
+        ranges=[quantities.length(r) for r in _RANGES_M],
         significance=SIGNIFICANCE,
     )
 
@@ -84,7 +85,7 @@ def _noise(card: Card) -> list[tuple[str, ...]]:
         (
             law[0],
             " to ".join(dict.fromkeys((date(min(times)), date(max(times))))),
-            *(words.length(law[1] + law[2] * r**2) for r in _RANGES_M),
+            *(quantities.length(law[1] + law[2] * r**2) for r in _RANGES_M),
         )
         for law, times in rows.items()
     ]

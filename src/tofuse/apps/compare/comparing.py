@@ -15,8 +15,9 @@ from tofuse.apps.compare.deviations import COVERAGE, DeviationMap, Places, fitte
 from tofuse.apps.compare.nearest import Reach, Reference, measured_points
 from tofuse.apps.compare.surface import Comparable, Surface, in_metres, spacing_of, surface_of
 from tofuse.apps.pairs import PairResult, pair_words, register
-from tofuse.apps.report import scene, words
+from tofuse.apps.report import scene
 from tofuse.apps.results import run_json
+from tofuse.engine import quantities
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.bounds import Bounds
@@ -191,8 +192,8 @@ class Comparison:
         if self.given:
             found += f" ({self.given})"
         found += (
-            f". {words.percent(1 - self.seen)} of the reference was not seen, and of what was "
-            f"measured {words.percent(self.deviations.beyond)} has no counterpart in it."
+            f". {quantities.percent(1 - self.seen)} of the reference was not seen, and of what was "
+            f"measured {quantities.percent(self.deviations.beyond)} has no counterpart in it."
         )
         if not self.deviations.unmatched:
             return found
@@ -201,7 +202,7 @@ class Comparison:
         area = 1e4 * sum(each.area_m2 for each in self.deviations.unmatched)
         return (
             f"{found} The reference lacks {area:.0f} cm\N{SUPERSCRIPT TWO} of what was measured, "
-            f"most of it around ({at}) mm, up to {words.length(first.distance_m)} away: "
+            f"most of it around ({at}) mm, up to {quantities.length(first.distance_m)} away: "
             "a feature is missing, additional or elsewhere, or something touches the part."
         )
 
@@ -334,7 +335,7 @@ def compared(
     deviations = mapped(measured, reference, T, reach, tolerance_m, shared_m, free)
     if not len(deviations.places.deviation):
         raise InputError(
-            f"has no surface within {words.length(reach.along)} of {reference.surface.name}"
+            f"has no surface within {quantities.length(reach.along)} of {reference.surface.name}"
             + (f" ({reason})" if reason else ""),
             where=measured.name,
             remedy="check the units (--unit), or pass --guess",
@@ -479,7 +480,7 @@ def _slides(reference: Reference, T: Float64, directions: Float64) -> bool:
 def _motion_words(motion: Float64) -> str:
     angle = np.degrees(se3.angle(motion))
     if angle < 1:
-        return f"moved by {words.length(float(np.linalg.norm(motion[:3, 3])))}"
+        return f"moved by {quantities.length(float(np.linalg.norm(motion[:3, 3])))}"
     axis = se3.so3_log(motion[:3, :3])
     about = pair_words.vector(axis / np.linalg.norm(axis), 2)
     return f"turned by {angle:.0f}\N{DEGREE SIGN} about {about}"

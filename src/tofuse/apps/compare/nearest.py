@@ -6,11 +6,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from tofuse.apps.compare.surface import Surface, spacing_of
 from tofuse.engine.arrays import Bool, Float64, Intp
+from tofuse.engine.connections import parts_of
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import KdTree, unit_vectors
 from tofuse.engine.geometry import triangles as triangle_geometry
@@ -294,8 +293,7 @@ def _smooth_faces(corners: Float64, normals: Float64) -> tuple[Intp, Float64]:
     paired = count == 2
     a, b = face[order[first[paired]]], face[order[first[paired] + 1]]
     smooth = (normals[a] * normals[b]).sum(1) > np.cos(_SHARP_RAD)
-    graph = coo_array((np.ones(smooth.sum()), (a[smooth], b[smooth])), shape=(len(corners),) * 2)
-    label = connected_components(graph, directed=False)[1]
+    label = parts_of(len(corners), np.stack([a[smooth], b[smooth]], 1))
     is_sharp = np.ones(len(count), bool)
     is_sharp[np.flatnonzero(paired)[smooth]] = False
     sharp = places[order[first[is_sharp]]]

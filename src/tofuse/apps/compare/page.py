@@ -9,6 +9,7 @@ import numpy as np
 from tofuse.apps.compare.comparing import Comparison, millimetres
 from tofuse.apps.compare.deviations import COVERAGE
 from tofuse.apps.report import fields, html, plots, scene, thumbnails, words
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64, UInt8
 
 # Of inside, no and outside deviations, and of what was not seen: distinct for the colour-blind.
@@ -55,7 +56,7 @@ def write_compare_report(comparison: Comparison, path: Path) -> None:
     regions = [r for r in comparison.regions if r.places]
     regions.sort(key=lambda r: -abs(r.worst_m))
     unseen = [r for r in comparison.regions if not r.places]
-    ends = [f"{s}{words.length(limit)}" for s in ("\N{MINUS SIGN}", "+")]
+    ends = [f"{s}{quantities.length(limit)}" for s in ("\N{MINUS SIGN}", "+")]
     html.write_page(
         path,
         "compare.html.j2",
@@ -87,7 +88,10 @@ def _facts(comparison: Comparison) -> list[tuple[str, str]]:
     ]  # fmt: skip
     finite = np.isfinite(places.sigma)
     sigma = COVERAGE * float(np.median(places.sigma))
-    facts += [("Seen", words.percent(comparison.seen)), ("Places", f"{len(places.deviation):,}")]
+    facts += [
+        ("Seen", quantities.percent(comparison.seen)),
+        ("Places", f"{len(places.deviation):,}"),
+    ]
     if finite.any():
         limit = float(np.median(places.detectable))
         facts.append(("Typical uncertainty", f"{millimetres(sigma)} mm"))
@@ -128,7 +132,7 @@ def compare_scene(comparison: Comparison) -> tuple[scene.Scene, fields.Field]:
     sigma = np.concatenate([found.sigma[rows], missing])
     finite = sigma[np.isfinite(sigma)]
     high = max(float(np.percentile(finite, 98)), 1e-6) if len(finite) else 1e-3
-    labels = "0", words.length(high / 2), words.length(high)
+    labels = "0", quantities.length(high / 2), quantities.length(high)
     return drawn, fields.Field("sigma", "Sigma", sigma, 0.0, high, labels, (0.0, high))
 
 

@@ -11,13 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from tofuse.apps.compare.nearest import Distances, Reference
 from tofuse.apps.report import scene
 from tofuse.engine.arrays import Bool, Float64, Intp
+from tofuse.engine.connections import parts_of
 from tofuse.engine.geometry import KdTree, unit_vectors
 
 # Points of a place.
@@ -163,6 +162,8 @@ def _behind(
     It is 0 where one may have seen the point. The outline, which may be off by the limit, hides
     nothing.
     """
+    if not len(eyes):
+        return np.zeros(len(points))
     centre = reference.centres.mean(0)
     behind = np.full(len(points), np.inf)
     left = np.flatnonzero(np.linalg.norm(points - centre, axis=1) < reference.diagonal)
@@ -221,5 +222,4 @@ def _components(places: Float64, limit: float) -> Intp:
     index, distance2 = KdTree(places).neighbours(places, min(_NEIGHBOURS, len(places)))
     near = distance2 <= limit**2
     rows = np.broadcast_to(np.arange(len(places))[:, None], index.shape)[near]
-    graph = coo_array((np.ones(len(rows)), (rows, index[near])), shape=(len(places),) * 2)
-    return np.asarray(connected_components(graph, directed=False)[1], np.intp)
+    return parts_of(len(places), np.stack([rows, index[near]], 1))

@@ -9,6 +9,7 @@ import numpy as np
 from tofuse.apps.pairs import pair_words
 from tofuse.apps.pairs.result import PairResult
 from tofuse.apps.report import fields, html, scene, thumbnails, words
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames import CloudFrame
 from tofuse.engine.geometry import se3
@@ -86,7 +87,7 @@ def pair_scene(result: PairResult) -> tuple[scene.Scene, fields.Field]:
     )
     median = float(np.nan_to_num(np.median(distance))) if len(distance) else 0.0
     cap = max(_MEDIANS_PER_CAP * median, 1e-3)
-    ticks = ("0", words.length(cap / 2), words.length(cap))
+    ticks = ("0", quantities.length(cap / 2), quantities.length(cap))
     label = "Distance to the other view"
     return drawn, fields.Field("distance", label, distance, 0.0, cap, ticks, (0.0, cap))
 

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.apps.report import words
 from tofuse.apps.report.packing import pack
 from tofuse.apps.report.scene import Scene
 from tofuse.apps.report.thumbnails import percentile_range
 from tofuse.engine.arrays import Float64
 from tofuse.engine.fusion import UNKNOWN_M
 from tofuse.engine.normal import OF_95_PERCENT
+from tofuse.engine.quantities import length
 
 # Accuracies are stored as bytes on a logarithmic scale from 0.1 mm on, in steps of 4.9 %.
 _MIN_ACCURACY_M = 1e-4
@@ -83,7 +83,11 @@ def fields(scene: Scene, errors: Float64 | None = None) -> list[Field]:
     views = scene.views if mesh is None else mesh.views
     available = [] if sigma is None else [accuracy(OF_95_PERCENT * sigma.astype(float), errors)]
     low, high = percentile_range(-points[:, 1])
-    ticks = words.length(0.0), words.length((high - low) / 2), words.length(high - low)
+    ticks = (
+        length(0.0),
+        length((high - low) / 2),
+        length(high - low),
+    )
     available.append(Field("height", "Height", -points[:, 1], low, high, ticks, (low, high)))
     if views is not None:
         counts = views.astype(float)
@@ -113,7 +117,7 @@ def accuracy(values: Float64, errors: Float64 | None = None) -> Field:
     suffix = " or not constrained" if (values >= UNKNOWN_M).mean() > 0.001 else ""
     middle = float(np.sqrt(low * high))
     labels = (
-        f"±{words.length(low)}", f"±{words.length(middle)}", f"±{words.length(high)}{suffix}"
+        f"±{length(low)}", f"±{length(middle)}", f"±{length(high)}{suffix}"
     )  # fmt: skip
     span = (_MIN_ACCURACY_M, max_bound)
     return Field("accuracy", "Accuracy (95 %)", values, low, high, labels, span, logarithmic=True)

@@ -10,6 +10,7 @@ import numpy as np
 
 from tofuse.apps.report import plots, thumbnails, words
 from tofuse.apps.report.subject import ROWS, Subject, Values
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.compute import run_all, trim_memory
 from tofuse.engine.frames import Frame, RangeFrame
@@ -92,9 +93,9 @@ def frame_text(record: FrameRecord, components: Sequence[Component] = ()) -> str
     if record.reason:
         parts[0] += f" – {record.reason}"
     if record.inlier_share is not None:
-        parts.append(f"{words.percent(record.inlier_share)} inliers")
+        parts.append(f"{quantities.percent(record.inlier_share)} inliers")
     if record.rms_m is not None:
-        parts.append(f"rms residual {words.length(record.rms_m)}")
+        parts.append(f"rms residual {quantities.length(record.rms_m)}")
     if len(record.unobservable):
         parts.append(f"{len(record.unobservable)} of 6 directions unobservable")
     if record.component is not None and len(components) > 1:
@@ -115,7 +116,7 @@ def _player(s: Subject) -> Values | None:
     records = {r.index: r for r in s.result.diagnostics.frames}
     listed = [records.get(p.index) for p in samples]
     kinds = {kind: title for kind, title in _KINDS.items() if kind in images[0]}
-    note = f"Range from dark ({words.length(low)}) to bright ({words.length(high)})."
+    note = f"Range from dark ({quantities.length(low)}) to bright ({quantities.length(high)})."
     if len(samples) < len(records):
         note = f"{len(samples):,} of {len(records):,} frames have images here. " + note
     return {

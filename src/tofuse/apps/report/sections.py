@@ -18,6 +18,7 @@ from tofuse.apps.report import (
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.html import script, write_page
 from tofuse.apps.report.subject import INNER_ENDS, OUTER_ENDS, Subject, Values
+from tofuse.engine import quantities
 from tofuse.engine.compute import job_pool
 from tofuse.engine.results import Reconstruction, accuracy_card
 
@@ -124,7 +125,7 @@ def _plain(s: Subject) -> str:
     width, height, depth = map(words.rounded_length, sizes.tolist(), (sizes - inner).tolist())
     accuracy = s.result.diagnostics.accuracy
     if accuracy.assessed and np.isfinite(accuracy.position_m):
-        known = f"and its parts fit together to about {words.length(accuracy.position_m)}"
+        known = f"and its parts fit together to about {quantities.length(accuracy.position_m)}"
     else:
         known = "but how well its parts fit together could not be determined"
     return f"It is about {width} wide, {height} high and {depth} deep, {known}."

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.frames import frame_ranges
-from tofuse.engine.quantities import length as length
-from tofuse.engine.quantities import percent as percent
+from tofuse.engine.quantities import length
 from tofuse.engine.results import Reason, verdicts
 
 STATUSES = ("tracked", "predicted", "lost", "skipped")

@@ -16,9 +16,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csgraph
 
 from tofuse.engine.arrays import Bool, Float64, Intp
+from tofuse.engine.connections import parts_of
 from tofuse.engine.quality import cross_view_agreement
 from tofuse.engine.views import PreparedView
 
@@ -150,7 +150,7 @@ class _Pairs:
         while (known != before).any():
             before = known
             known = known | [self._shows(k, before, *shares[k]) for k in range(len(still))]
-        groups = csgraph.connected_components(self._agrees & np.outer(known, known))[1]
+        groups = parts_of(len(known), np.argwhere(self._agrees & np.outer(known, known)))
         largest = np.argmax(np.bincount(groups[known]))
         return np.asarray(known & (groups == largest))
 

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from tofuse.engine.arrays import Float64
+from tofuse.engine.connections import parts_of
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp import icp_kernels
 from tofuse.engine.parts import part
@@ -84,7 +84,7 @@ def solve_correspondences(
             break
     out = se3.pose(R, -laplacian_inverse @ np.einsum("kab,ikb->ia", R, first_moment))
     # Gauge freedom of the connected views: the first one is fixed.
-    component = connected_components(laplacian != 0, directed=False)[1]
+    component = parts_of(len(laplacian), np.argwhere(laplacian != 0))
     anchor = np.unique(component, return_index=True)[1][component]
     return poses[anchor] @ se3.inverse(out[anchor]) @ out, errors
 
