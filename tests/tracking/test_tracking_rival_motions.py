@@ -55,7 +55,7 @@ WITH_NEAR = se3.translation((-SHIFT * NEAR_M / FOCAL, 0.0, 0.0))
 
 def test_camera_that_follows_near_surface_is_noticed() -> None:
     share, winner, rest = compared(110, WITH_NEAR, {STANDS: np.eye(4)})
-    assert share > 0.5
+    assert share > 0.4  # of the view; more is occluded, or out of view
     assert winner == STANDS
     assert 0.25 < rest < 0.75  # the near surface is larger in the image, and still is open
 
@@ -79,9 +79,36 @@ def test_equal_motions_are_no_rivals() -> None:
 def test_rival_that_everything_follows_leaves_nothing_open() -> None:
     """The tracked motion was wrong, and nothing else moves."""
     share, winner, rest = compared(0, WITH_NEAR, {STANDS: np.eye(4)})
-    assert share > 0.9
+    assert share > 0.7
     assert winner == STANDS
     assert rest < 0.1
+
+
+def test_share_is_that_of_the_view() -> None:
+    """All that is decided follows the rival; most of both views is too noisy to tell."""
+    views = []
+    for index, shift in ((0, 0), (2, SHIFT)):
+        frame = image(index, 70, shift)
+        noise = np.random.default_rng(index).uniform(1, 3, frame.depth.shape)
+        noisy = np.where(np.arange(WIDTH) < 70, frame.depth, noise).astype(np.float32)
+        frame = RangeFrame(index, index / 15, CAMERA, noisy)
+        views.append(prepare_view(frame, SurfaceOptions()))
+    keyframe = Keyframe(views[0], np.eye(4), 0)
+    rivals = {STANDS: Rival(keyframe, np.eye(4)), "goes on": Rival(keyframe, WITH_NEAR)}
+    share, _, _ = RivalMotions().compare(views[1], np.eye(4), rivals, 1.0)
+    assert 0.2 < share < 0.4
+
+
+def test_rival_that_has_become_the_tracked_motion_is_none() -> None:
+    before = prepare_view(image(0, 110), SurfaceOptions())
+    now = prepare_view(image(2, 110, SHIFT), SurfaceOptions())
+    keyframe = Keyframe(before, np.eye(4), 0)
+    motions = RivalMotions()
+    for T_rival, is_open in ((WITH_NEAR, True), (np.eye(4), False)):
+        rivals = {STANDS: Rival(keyframe, np.eye(4)), "goes on": Rival(keyframe, T_rival)}
+        for _ in range(2):  # every second view is compared
+            share = motions.compare(now, np.eye(4), rivals, 1.0).share
+        assert (share > 0.25) == is_open
 
 
 @pytest.mark.parametrize("columns", [80, 120])

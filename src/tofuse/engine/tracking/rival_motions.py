@@ -8,9 +8,10 @@ the albedo on surfaces that both motions map onto themselves. As what is near ma
 what is far then shows it only in the long run, a third rival is that the camera has stood still
 since an earlier view, as long as nothing refutes it.
 
-The shares of the view that follow either motion are those of the mixture of both with the largest
+The shares of the cells that follow either motion are those of the mixture of both with the largest
 likelihood, over a window of frames. They are counted by solid angle and by area of surface: what is
-near must not win by its size in the image.
+near must not win by its size in the image. Where few cells say anything, as many others are
+occluded, noisy or out of view, they are that much smaller a share of the view.
 """
 
 from __future__ import annotations
@@ -97,7 +98,7 @@ class RivalMotions:
 
     def __init__(self) -> None:
         self.stood_since: Keyframe | None = None
-        self._windows: dict[str, deque[Float64]] = {}
+        self._windows: dict[str, deque[_Evidence]] = {}
         self._share, self._views = 0.0, 0
 
     def reset(self, stood_since: Keyframe | None = None) -> None:
@@ -138,16 +139,35 @@ class RivalMotions:
                 tracked = _Tracked(view, keyframe.view, T, scale)
                 tracked_from[keyframe.view.index] = tracked
             window = self._windows.setdefault(name, deque(maxlen=_WINDOW))
-            window.append(tracked.histograms(T_rival, shortcut=name != STOOD))
+            window.append(tracked.evidence(T_rival, shortcut=name != STOOD))
             if name == STOOD and (tracked.refutes(window[-1]) or not tracked.overlaps):
                 self.stood_since = None
-            of_cells, of_area = (_share(weights) for weights in np.sum(window, axis=0))
-            self._share = max(self._share, of_cells, of_area)
-            if not winner and of_area > 0.5 and window[-1].any():
-                winner, rest = name, 1 - min(of_cells, of_area)
+            if not window[-1].visible:  # now it is the tracked motion
+                continue
+            histograms = np.sum([e.histograms for e in window], axis=0)
+            of_cells, of_area = map(_share, histograms)
+            decisive = histograms[0].sum() / sum(e.visible for e in window)
+            self._share = max(self._share, decisive * max(of_cells, of_area))
+            if not winner and of_area > 0.5:
+                winner, rest = name, decisive * (1 - min(of_cells, of_area))
         if self.stood_since is None:
             self.stood_since = rivals[STANDS].keyframe
         return Rivalry(self._share, winner, rest)
+
+
+class _Evidence(NamedTuple):
+    """Likelihood ratios of the cells of two views, between the tracked motion and a rival.
+
+    Attributes
+    ----------
+    histograms
+        (2, B) of those that say anything: by number of cells, and by area, with the same total.
+    visible
+        Number of cells with a depth; 0 if the motions are the same.
+    """
+
+    histograms: Float64
+    visible: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,12 +182,20 @@ class _Tracked:
     @property
     def overlaps(self) -> bool:
         """Whether the views overlap in more than half of the smaller one."""
-        views = self.view, self.reference
-        valid = [np.count_nonzero(v.z[:: stride_of(v), :: stride_of(v)]) for v in views]
-        return bool(2 * np.count_nonzero(self._forward) > min(valid))
+        return bool(2 * np.count_nonzero(self._forward) > min(self._visible))
 
-    def refutes(self, histograms: Float64) -> bool:
-        """Whether nothing follows a rival, with these histograms, although it could be seen."""
+    @cached_property
+    def _visible(self) -> tuple[int, int]:
+        """Numbers of cells with a depth, of the view and of the reference."""
+        view, reference = (
+            int(np.count_nonzero(v.z[:: stride_of(v), :: stride_of(v)]))
+            for v in (self.view, self.reference)
+        )
+        return view, reference
+
+    def refutes(self, evidence: _Evidence) -> bool:
+        """Whether nothing follows a rival, although it could be seen."""
+        histograms = evidence.histograms
         return bool(not self._settled and histograms.any()) and not any(map(_share, histograms))
 
     @cached_property
@@ -179,18 +207,18 @@ class _Tracked:
         T = se3.inverse(self.T_reference_view)
         return _outcome(self.reference, self.view, T, self.scale)
 
-    def histograms(self, T_rival: Float64, *, shortcut: bool) -> Float64:
-        """Return histograms (2, B) of likelihood ratios: by number of cells, and by area.
+    def evidence(self, T_rival: Float64, *, shortcut: bool) -> _Evidence:
+        """Compare both views at a rival's motion T_rival (4, 4).
 
         With a shortcut, all that agrees is against a rival that can't matter.
         """
         total = np.zeros((2, len(_CENTRES)))
-        T = self.T_reference_view
+        T, visible = self.T_reference_view, sum(self._visible)
         if _shift(self.view, se3.inverse(T) @ T_rival) < _MIN_SHIFT:
-            return total
+            return _Evidence(total, 0)
         if self._settled and shortcut:
             total[:, 0] = self._settled
-            return total
+            return _Evidence(total, visible)
         for a, b, motions, outcome in (
             (self.view, self.reference, (T, T_rival), self._forward),
             (self.reference, self.view, (se3.inverse(T), se3.inverse(T_rival)), self._backward),
@@ -201,7 +229,7 @@ class _Tracked:
             for row, weights in zip(total, (np.ones_like(area), area), strict=True):
                 row += np.histogram(llr, _BINS, weights=weights)[0]
         total[1] *= total[0].sum() / max(total[1].sum(), 1e-9)
-        return total
+        return _Evidence(total, visible)
 
     @cached_property
     def _settled(self) -> int:
