@@ -47,6 +47,7 @@ CHECKS: tuple[Check, ...] = (
     motion_checks.check_motion,
     motion_checks.check_still,
     motion_checks.check_walls,
+    pose_convention.check_poses,
 )
 
 
@@ -126,9 +127,7 @@ def inspect_recording(
         raise InputError("no frame can be read", where=recording.path, remedy=notes[-1])
     # BLAS results depend on its number of threads.
     with threadpool_limits(1):
-        # A run measures poses, and doesn't depend on those that come with the recording.
-        checks = CHECKS if quick else (*CHECKS, pose_convention.check_poses)
-        findings = [f for check in checks for f in check(sample)]
+        findings = [f for check in CHECKS for f in check(sample)]
     findings.sort(key=lambda f: SEVERITIES.index(f.severity))
     return Inspection(recording, tuple(findings), tuple(notes), sample.frames)
 
