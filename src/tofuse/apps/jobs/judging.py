@@ -409,6 +409,8 @@ class _Keeping:
     frames: dict[int, Frame] = field(default_factory=dict)
 
     def __getattr__(self, name: str) -> Any:
+        if name == "source":  # while a copy is made, it has none yet
+            raise AttributeError(name)
         return getattr(self.source, name)
 
     def read(self, index: int) -> Frame:
