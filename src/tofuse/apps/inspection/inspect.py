@@ -22,6 +22,7 @@ from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.noise import family_of
 from tofuse.engine.quantities import percent
 from tofuse.formats.recordings import open_recording
+from tofuse.formats.rigs import check_one_camera
 
 # Number of sampled pairs of neighbours, for `inspect` and at the start of a run.
 PAIRS, QUICK_PAIRS = 8, 4
@@ -121,6 +122,7 @@ def inspect_recording(
     """
     if not isinstance(recording, Recording):
         recording = open_recording(recording)
+    check_one_camera(recording)
     sample = Sample.of(recording, QUICK_PAIRS if quick else PAIRS, turning=turning)
     notes = [*recording.warnings, *(str(error) for error in sample.unreadable)]
     if not sample.frames:
