@@ -133,13 +133,16 @@ class Bag:
         D: tuple[float, ...] = (0.1, 0.02),
         lens: Pinhole = DEPTH_LENS,
         P: np.ndarray | None = None,
+        binning: tuple[int, int] = (0, 0),
+        roi: tuple[int, int, int, int] = (0, 0, 0, 0),
     ) -> None:
+        """With `roi` x, y, height and width."""
         K = np.array([lens.fx, 0, lens.cx, 0, lens.fy, lens.cy, 0, 0, 1])
-        roi = self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+        window = self.make("sensor_msgs/msg/RegionOfInterest", *roi, False)
         D = (*D, *(0.0,) * (5 - len(D)))
         size = (lens.height, lens.width)
         values = (*size, model, np.array(D), K, np.eye(3).ravel())
-        values = (*values, np.zeros(12) if P is None else P.ravel(), 0, 0, roi)
+        values = (*values, np.zeros(12) if P is None else P.ravel(), *binning, window)
         self.write(topic, ros.INFO, 10.0, self.make(ros.INFO, self.header(10.0), *values))
 
     def cloud(

@@ -122,8 +122,9 @@ def test_missing_poses_are_left_out(sample, recording):
     assert not list(misread_poses(sample, se3.inverse(poses)))
 
 
-def test_inspection_reports_poses_of_recording(recording):
+@pytest.mark.parametrize("quick", [False, True])
+def test_inspection_reports_poses_of_recording(recording, quick):
     frames = list(recording)
     source = ArraySource(frames, recording.reference @ GL)
-    found = tofuse.inspect(Recording.of(source, "somewhere", "frames"))
+    found = tofuse.inspect(Recording.of(source, "somewhere", "frames"), quick=quick)
     assert [f.code for f in found.findings if f.severity == "warning"] == ["poses_misread"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
@@ -58,6 +59,7 @@ def test_device_poses_are_used_as_odometry(recording) -> None:
     # They remain the reference for comparison.
     np.testing.assert_array_equal(led.reference, recording.reference)
     assert led[0].index == phone[0].index
+    np.testing.assert_array_equal(copy.deepcopy(led).odometry, recording.reference)
 
 
 def test_reference_poses_are_used_for_comparison_only(recording) -> None:

@@ -283,6 +283,21 @@ def test_inconsistent_counts(tmp_path: Path, name: str) -> None:
         NativeSource(folder)
 
 
+def test_images_of_other_frames(tmp_path: Path) -> None:
+    """Names of another first number are paired in order, but not those with other gaps."""
+    folder = write(tmp_path / "a")
+    for k in range(3, -1, -1):
+        (folder / "color" / f"{k:06d}.png").rename(folder / "color" / f"{k + 1:06d}.png")
+    assert any("paired in order" in line for line in NativeSource(folder).warnings)
+    folder = write(tmp_path / "b")
+    (folder / "timestamps.txt").unlink()
+    for name in ("depth", "amplitude", "confidence"):
+        (folder / name / "000001.png").unlink()
+    (folder / "color" / "000002.png").unlink()
+    with pytest.raises(InputError, match="color: has names of other frames"):
+        NativeSource(folder)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [

@@ -73,6 +73,7 @@ def test_stray_of_early_version(tmp_path: Path) -> None:
 
 
 def test_stray_with_video_and_lens_of_each_frame(tmp_path: Path) -> None:
+    """The video was downscaled; the lens remains that of the images of ARKit."""
     made.make_stray(tmp_path / "scan", lenses=True)
     size = (320, 240)
     path = str(tmp_path / "scan" / "rgb.mp4")
@@ -88,7 +89,7 @@ def test_stray_with_video_and_lens_of_each_frame(tmp_path: Path) -> None:
         frame = recording[k]
         assert abs(int(frame.color_image[5, 5, 0]) - (100 + 40 * k)) < 12
         assert isinstance(frame.camera, Pinhole)
-        assert frame.camera.fx == pytest.approx((made.FX + k) * made.WIDTH / 320)
+        assert frame.camera.fx == pytest.approx((made.FX + k) * made.WIDTH / 1920)
     assert recording.warnings == []
     data = Path(path).read_bytes()
     Path(path).write_bytes(data[: len(data) // 2])

@@ -103,6 +103,20 @@ def test_lens_is_that_of_the_topic_of_like_name(
     assert open_recording(bag.close())[0].camera == DEPTH_LENS
 
 
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_lens_of_binned_part_of_images(tmp_path: Path, kind: str) -> None:
+    """As image_proc's crop_decimate describes its images; other sizes remain errors of frames."""
+    whole = Pinhole(64, 48, 40.0, 42.0, 31.0, 23.0)
+    bag = Bag(tmp_path, kind)
+    bag.info("/a/depth/camera_info", D=(), lens=whole, binning=(2, 2), roi=(16, 8, 24, 32))
+    bag.image("/a/depth/image", 10, COUNTS[0], "16UC1")
+    bag.image("/a/depth/image", 11, COUNTS[0][1:], "16UC1")
+    recording = open_recording(bag.close())
+    assert recording[0].camera == Pinhole(16, 12, 20.0, 21.0, 7.5, 7.5)
+    with pytest.raises(InputError, match="16 x 11"):
+        recording[1]
+
+
 def test_depth_of_depthai(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "mcap")
     bag.info("/oak/stereo/camera_info")
@@ -558,3 +572,14 @@ def test_poses_from_tf(tmp_path: Path, kind: str) -> None:
         np.testing.assert_allclose(recording.reference[k], expected, atol=1e-6)
     assert np.isnan(recording.reference[2]).all()
     assert np.isnan(recording.odometry[2]).all()
+
+
+def test_tf_without_the_frame_of_depth(tmp_path: Path) -> None:
+    """The latched /tf_static is missing: the robot moves, and nothing says where the camera is."""
+    bag = Bag(tmp_path, "mcap")
+    depth_bag(bag)
+    for k, T in enumerate(T_WORLD_RIG):
+        bag.tf("/tf", 9.95 + 0.1 * k, "odom", "base_link", T)
+    recording = open_recording(bag.close())
+    assert recording.odometry is None
+    assert any("/tf_static was not recorded" in line for line in recording.warnings)

@@ -22,7 +22,7 @@ from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.formats.poses.trajectory import read_tum
 from tofuse.formats.recordings.native import RecordingWriter
-from tofuse.formats.recordings.open import open_recording
+from tofuse.formats.recordings.open import Opening, open_recording
 from tofuse.formats.rigs.rig_file import Rig, RigCamera, read_rig, write_rig
 from tofuse.lab.simulation.rig import camera_ring, relative
 
@@ -128,6 +128,9 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "cam0, cam1</td>" in report
     assert ">cam1</text>" in report or ">cam1<" in report
 
+    # Its images are found again.
+    assert main(["export", str(tmp_path / "model"), "octomap"]) == 0
+
     # The camera of each frame is stated: in the file and in the report.
     run_json = json.loads((tmp_path / "model" / "run.json").read_text())["rig"]
     assert run_json == {"cameras": ["cam0", "cam1"], "of_frames": [0, 1, 0, 1]}
@@ -151,6 +154,35 @@ def test_displaced_camera_is_found(
     assert main(["rig", "check", str(tmp_path / "knocked.json"), *cameras]) == 3
     output = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in output if "moved by" in line] == ["cam2"]
+
+
+def test_recordings_of_rig_are_opened_again(tmp_path: Path) -> None:
+    """As a result states them, with a rig.json elsewhere."""
+    folder = written(tmp_path / "rig", cameras=2)
+    names = ("cam0", "cam1")
+    rows = [RigCamera(name, "", np.eye(4), np.zeros((6, 6))) for name in names]
+    write_rig(tmp_path / "rig.json", Rig(tuple(rows)))
+    opening = Opening(tuple(folder / name for name in names), tmp_path / "rig.json")
+    again = Opening.from_dict(opening.to_dict(), "run.json")
+    assert again == opening
+    recording = again.open()
+    assert recording.metadata["cameras"] == list(names)
+    with pytest.raises(InputError, match=r"has 2 cameras .* 1 recordings are given"):
+        replace(opening, paths=opening.paths[:1]).open()
+
+
+def test_rig_is_not_taken_for_one_camera(tmp_path: Path, capsys) -> None:
+    folder = written(tmp_path / "rig", cameras=2)
+    rows = [RigCamera(f"cam{k}", "", np.eye(4), np.zeros((6, 6))) for k in range(2)]
+    write_rig(folder / "rig.json", Rig(tuple(rows)))
+    recording = open_recording(folder)
+    poses = np.tile(np.eye(4), (len(recording), 1, 1))
+    for use in (tofuse.inspect, tofuse.reconstruct, lambda r: tofuse.judge(r, poses)):
+        with pytest.raises(InputError, match="is a rig of several cameras"):
+            use(recording)
+    for words in (["inspect"], ["noise"], ["calibrate", "depth"]):
+        assert main([*words, str(folder)]) == 2
+        assert "is a rig of several cameras" in capsys.readouterr().err
 
 
 @pytest.mark.nightly

@@ -51,6 +51,7 @@ from tofuse.engine.mapping import Mapper as OnlineMapper
 from tofuse.engine.parts import name_of
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction, accuracy_card
+from tofuse.formats.rigs import check_one_camera
 
 if TYPE_CHECKING:
     from tofuse.apps.viewer import ReportServer
@@ -366,6 +367,7 @@ def reconstruct(
             where="recording",
             remedy="pass tofuse.open(path), or tofuse.from_arrays(depth, K)",
         )
+    check_one_camera(recording)
     with _with_terminal(progress) as display:
         chosen = _configuration(config, recording)
         # No sensor measures the motion relative to a moving object.

@@ -31,6 +31,7 @@ from tofuse.engine.sensor import DepthCorrection
 from tofuse.formats.cameras import camera_file, read_correction, write_correction, write_noise
 from tofuse.formats.files import atomic
 from tofuse.formats.recordings import Opening, open_recording
+from tofuse.formats.rigs import check_one_camera
 
 # Data for JSON, lines to print, and warnings.
 Summary = tuple[dict[str, Any], list[str], list[str]]
@@ -53,7 +54,7 @@ def noise(arguments: Noise) -> int:
     """``tofuse noise``."""
     if arguments.out is not None:
         check_new(arguments.out, overwrite=arguments.overwrite)
-    fit = estimate_noise(Opening.of(arguments.inputs, arguments).open(), arguments.name)
+    fit = estimate_noise(_recording(arguments), arguments.name)
     if arguments.out is not None:
         write_noise(arguments.out, fit.model)
     table = Table(_NOISE_UNITS[fit.law], "pixels", "measured (mm)", "model (mm)", box=None)
@@ -74,10 +75,16 @@ def noise(arguments: Noise) -> int:
     )
 
 
+def _recording(arguments: Calibrate | Noise) -> Recording:
+    recording = Opening.of(arguments.inputs, arguments).open()
+    check_one_camera(recording)
+    return recording
+
+
 def _lens(arguments: Calibrate) -> Summary:
     """``tofuse calibrate lens``."""
     board = _board(arguments)
-    recording = Opening.of(arguments.inputs, arguments).open()
+    recording = _recording(arguments)
     fit = calibrate_lens(recording, board, arguments.model, arguments.image)
     lines = [_number(fit.camera, name, fit.sigma.get(name)) for name in fit.to_dict()["lens"]]
     lines.append(
@@ -96,7 +103,7 @@ def _lens(arguments: Calibrate) -> Summary:
 
 def _depth(arguments: Calibrate) -> Summary:
     """``tofuse calibrate depth``."""
-    recording = Opening.of(arguments.inputs, arguments).open()
+    recording = _recording(arguments)
     previous = _previous_correction(arguments, recording)
     if arguments.board is not None:
         board = Board.parse(arguments.board)

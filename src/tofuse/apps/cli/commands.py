@@ -99,14 +99,11 @@ def run(arguments: cli.Run) -> int:
     """``tofuse run``."""
     from tofuse.apps.cli import stage_times
     from tofuse.formats.recordings import unzipped
-    from tofuse.formats.rigs import recordings_of, rig_file_in
+    from tofuse.formats.rigs import rig_file_in
 
-    if arguments.rig is None and len(arguments.inputs) == 1:
-        arguments.rig = rig_file_in(unzipped(arguments.inputs[0]))
-        if arguments.rig is not None:
-            arguments.inputs = [str(path) for path in recordings_of(arguments.rig).values()]
-    if arguments.rig is not None:
-        return _run_rig(arguments.rig, arguments)
+    in_folder = len(arguments.inputs) == 1 and rig_file_in(unzipped(arguments.inputs[0]))
+    if arguments.rig is not None or in_folder:
+        return _run_rig(arguments)
     if arguments.view:
         return _run_live(arguments)
     for is_set, name in ((arguments.port is not None, "--port"), (arguments.no_open, "--no-open")):
@@ -140,8 +137,8 @@ def run_options(arguments: cli.Run) -> Options:
     return from_arguments(Options, arguments)
 
 
-def _run_rig(rig: Path, arguments: cli.Run) -> int:
-    """``tofuse run --rig``."""
+def _run_rig(arguments: cli.Run) -> int:
+    """``tofuse run --rig``, or of a folder with a rig.json."""
     from tofuse.apps.rigs import run_rig
 
     options = run_options(arguments)
@@ -150,7 +147,7 @@ def _run_rig(rig: Path, arguments: cli.Run) -> int:
             option = f"--{name.replace('_', '-')}"
             raise InputError("can't be used with a rig", where=option, remedy="leave it out")
     with progress_for(as_json=arguments.json) as progress:
-        rig_result = run_rig(rig, arguments.inputs, options, progress=progress)
+        rig_result = run_rig(arguments.rig, arguments.inputs, options, progress=progress)
     return _finished(rig_result.result, arguments.out, arguments)
 
 

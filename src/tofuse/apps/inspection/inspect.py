@@ -22,6 +22,7 @@ from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.noise import family_of
 from tofuse.engine.quantities import percent
 from tofuse.formats.recordings import open_recording
+from tofuse.formats.rigs import check_one_camera
 
 # Number of sampled pairs of neighbours, for `inspect` and at the start of a run.
 PAIRS, QUICK_PAIRS = 8, 4
@@ -47,6 +48,7 @@ CHECKS: tuple[Check, ...] = (
     motion_checks.check_motion,
     motion_checks.check_still,
     motion_checks.check_walls,
+    pose_convention.check_poses,
 )
 
 
@@ -120,15 +122,14 @@ def inspect_recording(
     """
     if not isinstance(recording, Recording):
         recording = open_recording(recording)
+    check_one_camera(recording)
     sample = Sample.of(recording, QUICK_PAIRS if quick else PAIRS, turning=turning)
     notes = [*recording.warnings, *(str(error) for error in sample.unreadable)]
     if not sample.frames:
         raise InputError("no frame can be read", where=recording.path, remedy=notes[-1])
     # BLAS results depend on its number of threads.
     with threadpool_limits(1):
-        # A run measures poses, and doesn't depend on those that come with the recording.
-        checks = CHECKS if quick else (*CHECKS, pose_convention.check_poses)
-        findings = [f for check in checks for f in check(sample)]
+        findings = [f for check in CHECKS for f in check(sample)]
     findings.sort(key=lambda f: SEVERITIES.index(f.severity))
     return Inspection(recording, tuple(findings), tuple(notes), sample.frames)
 

@@ -57,6 +57,7 @@ from tofuse.engine.tracking import FrameTime, find_jumps, given
 from tofuse.engine.views import PreparedView
 from tofuse.formats.poses import TimedPoses, read_poses
 from tofuse.formats.recordings import Opening, OpeningOptions, open_recording, read_reference
+from tofuse.formats.rigs import check_one_camera
 
 Views = Sequence[PosedView[PreparedView]]
 
@@ -199,6 +200,7 @@ def judge(
         check_number(tolerance_m, Bounds(0, exclusive=True), "tolerance_m")
     if not isinstance(recording, Recording):
         recording = open_recording(recording)
+    check_one_camera(recording)
     given_poses = poses_for(recording, trajectory)
     kind = reconstructing.view_kind(recording)
     # External sensors do not measure these poses, and images are compared with the stated camera.
@@ -409,6 +411,8 @@ class _Keeping:
     frames: dict[int, Frame] = field(default_factory=dict)
 
     def __getattr__(self, name: str) -> Any:
+        if name == "source":  # while a copy is made, it has none yet
+            raise AttributeError(name)
         return getattr(self.source, name)
 
     def read(self, index: int) -> Frame:

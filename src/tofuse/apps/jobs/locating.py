@@ -34,6 +34,7 @@ from tofuse.engine.stored_views import PosedView
 from tofuse.engine.tracking import Keyframes, given
 from tofuse.formats.poses import write_tum
 from tofuse.formats.recordings import Opening, OpeningOptions, open_view, split_name
+from tofuse.formats.rigs import check_one_camera
 
 # Frames of a clip that are located.
 _LOCATED = 4
@@ -278,6 +279,7 @@ def _located_in(
     frame: Frame | None
     if number is None:
         recording = Opening.of([path], options).open()
+        check_one_camera(recording)
         frame = recording.first_readable()
     elif (options.start, options.end, options.every) != (0, None, 1):
         raise InputError(

@@ -38,6 +38,7 @@ from tofuse.engine.stopwatch import timing
 from tofuse.formats.files import stamps
 from tofuse.formats.poses import read_loops
 from tofuse.formats.recordings import Opening
+from tofuse.formats.rigs import check_one_camera
 
 
 def run(
@@ -136,6 +137,7 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
     seed = seed_of(options)
     opening = Opening.of(inputs, options)
     recording = opening.open()
+    check_one_camera(recording)
     notes = tuple(recording.warnings)  # before most frames are read, which may add some
     if (frame := recording.first_readable()) is not None:  # shown before any work begins
         progress.placed(frame, np.eye(4))

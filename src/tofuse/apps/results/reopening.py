@@ -156,8 +156,8 @@ def reopen(part: StoredRecording, folder: Path) -> Recording:
         If it is missing, can't be opened, or has changed.
     """
     opening = locate_recording(part.opening, folder)
-    for path in (*opening.paths, *((opening.camera,) if opening.camera else ())):
-        if not path.exists():
+    for path in (*opening.paths, opening.camera, opening.rig):
+        if path is not None and not path.exists():
             raise InputError(
                 f"needs {path}, which doesn't exist",
                 where=folder,
@@ -199,6 +199,8 @@ class _Unchanged:
         self._source, self._depths, self._folder = source, depths, folder
 
     def __getattr__(self, name: str) -> Any:
+        if name == "_source":  # while a copy is made, it has none yet
+            raise AttributeError(name)
         return getattr(self._source, name)
 
     def read(self, index: int) -> Frame:

@@ -32,7 +32,8 @@ from tofuse.engine.results import Reason, Reconstruction, verdicts
 from tofuse.engine.stored_views import SampledView
 from tofuse.engine.tracking import given
 from tofuse.formats.poses import write_tum
-from tofuse.formats.rigs import Rig, RigSource, read_rig, recordings_of
+from tofuse.formats.recordings import Opening, unzipped
+from tofuse.formats.rigs import FILE_NAME, Rig, RigSource, read_rig, recordings_of
 
 # No loops are searched: poses of the rig are final.
 _NO_LOOPS = Nearby(min_gap=1_000_000)
@@ -66,9 +67,11 @@ class RigResult:
 
 
 def run_rig(
-    rig_file: Path, inputs: Sequence[str | Path], options: Options, *, progress: Progress
+    rig_file: Path | None, inputs: Sequence[str | Path], options: Options, *, progress: Progress
 ) -> RigResult:
     """Reconstruct the recordings of a rig's cameras, and write the output folder.
+
+    Without a `rig_file` the only input is a folder with one, beside the recordings.
 
     Raises
     ------
@@ -77,18 +80,24 @@ def run_rig(
     OutputError
         If the result can't be written.
     """
+    opening = Opening(tuple(map(Path, inputs)), rig_file, format=options.format)
+    if rig_file is None:
+        rig_file = unzipped(inputs[0]) / FILE_NAME
+        inputs = list(recordings_of(rig_file).values())
     with using_threads(options.threads), threadpool_limits(1):
         progress.stage("opening")
         cameras = open_cameras(inputs, options.format, list(recordings_of(rig_file)))
         recordings = [camera.recording for camera in cameras]
         source = RigSource(read_rig(rig_file), recordings)
-        full_recording = Recording.of(source, " ".join(map(str, inputs)), "rig")
+        full_recording = Recording.of(source, " ".join(map(str, opening.paths)), "rig")
         recording = _selected(full_recording, source, options)
         config = resolve(options)
         with folders.OutputFolder(options.out, overwrite=options.overwrite) as folder:
             result = reconstruct_rig(
                 cameras, recording, config, seed=options.seed or 0, progress=progress
             )
+            described = {**result.result.recording, "opening": opening.to_dict()}
+            result = replace(result, result=replace(result.result, recording=described))
             texture = options.make_texture(
                 recording, result.result, config, options.threads, progress
             )

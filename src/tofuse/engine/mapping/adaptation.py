@@ -298,6 +298,8 @@ class _WithOdometry:
     odometry: Float64 | None
 
     def __getattr__(self, name: str) -> Any:
+        if name == "source":  # while a copy is made, it has none yet
+            raise AttributeError(name)
         return getattr(self.source, name)
 
 

@@ -29,6 +29,7 @@ from tofuse.formats.images import write_png
 from tofuse.formats.poses import write_log, write_tum
 from tofuse.formats.readers import NativeSource
 from tofuse.formats.recordings import RecordingWriter
+from tofuse.formats.rigs import check_one_camera
 
 FINEST_UNIT_M = 1e-4
 MIN_SIGMA_UNIT_M = 1e-5
@@ -72,7 +73,7 @@ def convert(recording: Recording, folder: str | Path) -> Conversion:
 
 
 def _write(recording: Recording, folder: Path) -> tuple[int, list[str]]:
-    _check_one_camera(recording)
+    check_one_camera(recording)
     warnings: list[str] = []
     recording, correction = _uncorrected(recording)
     sample = recording.readable(_SAMPLED_FRAMES)
@@ -104,15 +105,6 @@ def _write(recording: Recording, folder: Path) -> tuple[int, list[str]]:
     if NOISE_MODEL in recording.metadata:
         write_noise(folder / "noise.json", recording.metadata[NOISE_MODEL])
     return len(written), warnings
-
-
-def _check_one_camera(recording: Recording) -> None:
-    if "cameras" in recording.metadata:
-        raise InputError(
-            "is a rig, and a folder like this holds one camera",
-            where=recording.path,
-            remedy="convert its recordings one by one",
-        )
 
 
 def _uncorrected(recording: Recording) -> tuple[Recording, DepthCorrection | None]:
@@ -272,7 +264,7 @@ def convert_to(recording: Recording, folder: str | Path, layout: Layout) -> Conv
 
 
 def _write_layout(recording: Recording, folder: Path, layout: Layout) -> tuple[int, list[str]]:
-    _check_one_camera(recording)
+    check_one_camera(recording)
     warnings: list[str] = []
     color_folder = "rgb" if layout == "tum" else "color"
     rectifier: Rectifier | None = None

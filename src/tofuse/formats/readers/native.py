@@ -216,8 +216,18 @@ class NativeSource(FileSource):
         files = reading.files_with(folder, *suffixes)
         if len(files) != len(self.files):
             raise self._count_error(folder, f"{len(files)} images")
-        if [f.stem for f in files] != [f.stem for f in self.files]:
-            self.warnings.append(f"{folder}: names differ from those in depth/; paired in order")
+        if [f.stem for f in files] == [f.stem for f in self.files]:
+            return files
+        # Numbers from another first one shift all names that both have, others are of other frames.
+        places = {f.stem: k for k, f in enumerate(files)}
+        shifts = {places[f.stem] - k for k, f in enumerate(self.files) if f.stem in places}
+        if 0 in shifts or len(shifts) > 1:
+            raise InputError(
+                "has names of other frames than depth/",
+                where=folder,
+                remedy="give the images of a frame one name, and remove those without a partner",
+            )
+        self.warnings.append(f"{folder}: names differ from those in depth/; paired in order")
         return files
 
     def _read_correction(self) -> DepthCorrection | None:

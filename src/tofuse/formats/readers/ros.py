@@ -167,7 +167,7 @@ class RosSource(bags.BagSource):
                 where=self.path,
                 remedy="pass the depth camera with --camera camera.json",
             )
-        self.camera = self._lens_of(candidates[0], self.connection)
+        self.camera = self._lens_of(candidates[0], self.connection, self._depth_size())
 
     def _camera_infos(self, connection: Any) -> list[Any]:
         """The CameraInfo connections in the namespace of an image connection, of like names first.
@@ -205,6 +205,12 @@ class RosSource(bags.BagSource):
             self.warnings.append(f"tf is ignored: {error}")
             return
         ancestors = transforms.ancestors(frame)
+        if transforms.any_moves and not transforms.moves(ancestors[-1], frame):
+            self.warnings.append(
+                f"tf has frames that move, but the frame of depth, {frame!r}, is attached to none "
+                "of them: if it should be, /tf_static was not recorded"
+            )
+            return
         odometry = next((name for name in ancestors if _ODOMETRY in name.lower()), None)
         if odometry is not None and transforms.moves(odometry, frame):
             poses = transforms.poses(odometry, frame, self.timestamps)
@@ -251,7 +257,7 @@ class RosSource(bags.BagSource):
             if T is None or not infos:
                 return False
             self.color_camera = camera_file.ColorCamera(
-                self._lens_of(infos[0], track.connection), T
+                self._lens_of(infos[0], track.connection, (first.shape[1], first.shape[0])), T
             )
         self.color = track
         return True
@@ -264,13 +270,25 @@ class RosSource(bags.BagSource):
             return True
         return connection.msgtype == IMAGE and self._encoding(connection).lower() in bags.COLORS
 
-    def _lens_of(self, info: Any, images: Any) -> Pinhole:
-        """The lens of a CameraInfo for a topic of images."""
+    def _depth_size(self) -> tuple[int, int] | None:
+        """Width and height of the first image; None if it can't be read."""
+        where = self.where(0)
+        with suppress(InputError), reading.library_errors(where, bags.REMEDY):
+            message = self.depth.message(0)
+            if self.connection.msgtype == IMAGE:
+                return int(message.width), int(message.height)
+            height, width = bags.decompressed(message, where).shape
+            return width, height
+        return None
+
+    def _lens_of(self, info: Any, images: Any, size: tuple[int, int] | None) -> Pinhole:
+        """The lens of a CameraInfo for a topic of images of a size (width, height)."""
         where = f"{self.path}: {info.topic}"
         rectified = _RECTIFIED.search(images.topic.lower()) is not None
         for _, _, raw in self.bag.messages(connections=[info]):
             message = self.bag.deserialize(raw, info.msgtype)
-            return bags.lens(message, where, rectified=rectified)
+            lens = bags.lens(message, where, rectified=rectified)
+            return lens if size is None else bags.shown_part(lens, message, size)
         raise InputError("has no message", where=where, remedy="use --camera camera.json")
 
     def _find_amplitude(self) -> bags.Track | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float64, Intp, UInt8
+from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
@@ -148,12 +149,19 @@ class StraySource(phones.PhoneSource):
 
     def _read_lenses(self, folder: Path, columns: dict[str, Float64], row: Intp) -> None:
         size = first_size(self.files)
-        image = phones.IMAGE_SIZE if self.video is None else (self.video.width, self.video.height)
+        images = [phones.IMAGE_SIZE]
+        if self.video is not None:
+            images.append((self.video.width, self.video.height))
+
+        def lens(K: Float64, where: str | Path) -> Pinhole:
+            # The video may have been downscaled since: K is of images around its centre.
+            image = min(images, key=lambda image: abs(K[0, 2] - image[0] / 2))
+            return phones.phone_lens(K, image, size, where)
+
         if reading.is_file(folder / "camera_matrix.csv"):
             path = folder / "camera_matrix.csv"
             K = tables.read_3x3(path, "copy it again")
-            common = phones.phone_lens(K, image, size, path)
-            self.cameras = [common] * len(row)
+            self.cameras = [lens(K, path)] * len(row)
         elif not all(name in columns for name in _LENS):
             raise InputError(
                 "is missing, and odometry.csv has no fx, fy, cx, cy",
@@ -167,8 +175,6 @@ class StraySource(phones.PhoneSource):
                 fx, fy, cx, cy = (columns[name][row[k]] for name in _LENS)
                 K = camera_file.intrinsic_matrix(fx, fy, cx, cy)
                 try:
-                    self.cameras[k] = phones.phone_lens(
-                        K, image, size, f"{folder / 'odometry.csv'}, frame {k}"
-                    )
+                    self.cameras[k] = lens(K, f"{folder / 'odometry.csv'}, frame {k}")
                 except InputError as error:
                     self.cameras[k] = error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -64,6 +64,7 @@ def open_recording(
     format: str | None = None,  # noqa: A002
     camera: str | Path | None = None,
     topic: str | None = None,
+    rig: str | Path | None = None,
     min_depth: float | None = None,
     max_depth: float | None = None,
 ) -> Recording:
@@ -82,6 +83,8 @@ def open_recording(
         A camera.json that replaces the recording's own camera.
     topic
         Topic of a bag with the depth images or clouds, instead of detection.
+    rig
+        A rig.json: the paths are the recordings of its cameras, in its order.
     min_depth, max_depth
         In m; nearer or farther points are dropped: by z in images, by distance in clouds.
 
@@ -98,14 +101,16 @@ def open_recording(
     _check_depths(min_depth, max_depth)
     inner = [unzipped(path) for path in paths]
     options = ReaderOptions(None if camera is None else Path(camera), topic)
-    rig_file = rig_file_in(inner[0]) if len(inner) == 1 else None
-    if rig_file is not None:
-        rig = _rig_source(rig_file, format, options)
+    in_folder = rig_file_in(inner[0]) if rig is None and len(inner) == 1 else None
+    if in_folder is not None:
+        rig, inner = in_folder, list(recordings_of(in_folder).values())
+    if rig is not None:
+        cameras = _rig_source(Path(rig), inner, format, options)
         if min_depth is not None or max_depth is not None:
             raise InputError(
                 "do not apply to a rig", where="min_depth, max_depth", remedy="leave them out"
             )
-        return Recording.of(rig, str(paths[0]), "rig")
+        return Recording.of(cameras, " ".join(map(str, paths)), "rig")
     for path in inner:
         _check_kind(path)
     located = [item for path in inner for item in _resolve(path, format)]
@@ -126,12 +131,20 @@ def open_recording(
 
 def _rig_source(
     rig_file: Path,
+    paths: Sequence[Path],
     format: str | None,  # noqa: A002
     options: ReaderOptions,
 ) -> RigSource:
-    """The recordings of a rig's cameras, in the folder of its file."""
-    recordings = []
-    for name, path in recordings_of(rig_file).items():
+    """The recordings of a rig's cameras, in its order."""
+    rig, recordings = read_rig(rig_file), []
+    names = [camera.name for camera in rig.cameras]
+    if len(paths) != len(names):
+        raise InputError(
+            f"has {len(names)} cameras ({', '.join(names)}), and {len(paths)} recordings are given",
+            where=rig_file,
+            remedy="pass one recording for each, in this order",
+        )
+    for name, path in zip(names, paths, strict=True):
         if not path.exists():
             raise InputError(
                 f"has no recording of the camera {name!r}",
@@ -144,7 +157,7 @@ def _rig_source(
         source = _opened(located[0], options)
         _check_usable(source, path)
         recordings.append(Recording.of(source, path, name_of(located[0].reader)))
-    return RigSource(read_rig(rig_file), recordings)
+    return RigSource(rig, recordings)
 
 
 @dataclass(frozen=True)
@@ -424,9 +437,12 @@ class Opening(OpeningOptions):
     ----------
     paths
         Files or folders.
+    rig
+        See `open_recording`.
     """
 
     paths: tuple[Path, ...]
+    rig: Path | None = None
 
     @classmethod
     def of(cls, inputs: Iterable[str | Path], options: object) -> Opening:
@@ -446,25 +462,28 @@ class Opening(OpeningOptions):
     def open(self) -> Recording:
         """Open the recording; InputError if that fails."""
         recording = open_recording(
-            *self.paths, format=self.format, camera=self.camera, topic=self.topic
+            *self.paths, format=self.format, camera=self.camera, topic=self.topic, rig=self.rig
         ).select(self.start, self.end, self.every)
         return average_still(recording) if self.average_still else recording
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data, with absolute paths."""
         options = {field.name: getattr(self, field.name) for field in fields(OpeningOptions)}
-        camera = None if self.camera is None else str(self.camera.absolute())
-        paths = [str(path.absolute()) for path in self.paths]
-        return {"paths": paths} | options | {"camera": camera}
+        files = {
+            name: None if file is None else str(file.absolute())
+            for name, file in (("camera", self.camera), ("rig", self.rig))
+        }
+        return {"paths": [str(path.absolute()) for path in self.paths]} | options | files
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], where: str | Path) -> Opening:
         """Return the inverse of `to_dict`; InputError naming `where` if the data is invalid."""
         try:
             paths = tuple(Path(str(path)) for path in data["paths"])
-            camera, end = data["camera"], data["end"]
+            camera, rig, end = data["camera"], data.get("rig"), data["end"]
             opening = cls(
                 paths,
+                None if rig is None else Path(str(rig)),
                 format=data["format"],
                 camera=None if camera is None else Path(str(camera)),
                 topic=data["topic"],

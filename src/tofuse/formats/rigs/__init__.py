@@ -6,6 +6,7 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.formats.rigs.rig_file import (
+        FILE_NAME,
         Disagreement,
         Rig,
         RigCamera,
@@ -14,6 +15,6 @@ if TYPE_CHECKING:
         rig_file_in,
         write_rig,
     )
-    from tofuse.formats.rigs.rig_source import RigSource
+    from tofuse.formats.rigs.rig_source import RigSource, check_one_camera
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

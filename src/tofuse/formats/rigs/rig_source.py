@@ -112,6 +112,16 @@ class RigSource:
         return replace(frame, index=index, timestamp=float(self.timestamps[index]))
 
 
+def check_one_camera(recording: Recording) -> None:
+    """Raise InputError if a recording is a rig's: as that of one camera, it would jump."""
+    if "cameras" in recording.metadata:
+        raise InputError(
+            "is a rig of several cameras",
+            where=recording.path,
+            remedy="pass the recording of one camera (`tofuse run` makes a model of all)",
+        )
+
+
 def with_range_added(frame: RangeFrame, metres: float) -> RangeFrame:
     """Return the image with `metres` added to its ranges."""
     if metres == 0:

@@ -459,6 +459,23 @@ def lens(message: Any, where: str, *, rectified: bool = False) -> Pinhole:
     return camera_file.checked_lens(MODELS[name], info.size, info.values | coefficients, where)
 
 
+def shown_part(lens: Pinhole, message: Any, size: tuple[int, int]) -> Pinhole:
+    """Return the lens of images of a size (width, height) from that of a CameraInfo.
+
+    Unless they have its size, they are the region of interest that it states, or binned.
+    """
+    roi, binning = message.roi, (max(message.binning_x, 1), max(message.binning_y, 1))
+    width, height = (
+        (roi.width or lens.width) // binning[0],
+        (roi.height or lens.height) // binning[1],
+    )
+    if size == (lens.width, lens.height) or size != (width, height):
+        return lens
+    fx, cx = lens.fx / binning[0], (lens.cx - roi.x_offset) / binning[0]
+    fy, cy = lens.fy / binning[1], (lens.cy - roi.y_offset) / binning[1]
+    return replace(lens, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+
+
 def cloud(message: Any, where: str) -> GeometryRecord:
     """Read points, amplitude and colour of a PointCloud2.
 
@@ -575,6 +592,11 @@ class Transforms:
                 break
             frames.append(parent)
         return frames
+
+    @property
+    def any_moves(self) -> bool:
+        """Whether any frame moves relative to its parent."""
+        return any(not edge.static for edge in self._edges.values())
 
     def moves(self, ancestor: str, frame: str) -> bool:
         """Whether a frame moves relative to one of its ancestors."""
