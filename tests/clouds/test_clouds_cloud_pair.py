@@ -125,7 +125,8 @@ def test_fused_cloud_is_seen_from_its_origin(scans):
     even = averaged(CloudFrame.of(scans[0]), 0.08)
     assert viewpoint_of(even) is None
     assert free_space_viewpoint(even) is not None
-    for place in ([4, 0, 0], [-4, 0, 0], [0, 0, 2]):  # behind walls, and under the floor
+    # Behind walls, under the floor, and far away, as in the coordinates of a site.
+    for place in ([4, 0, 0], [-4, 0, 0], [0, 0, 2], [30, 9, 24], [312, 93, 0]):
         assert free_space_viewpoint(CloudFrame.of(even.points + np.float32(place))) is None
 
 

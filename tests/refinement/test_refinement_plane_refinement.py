@@ -120,3 +120,14 @@ def test_two_sides_of_wall_stay_separate():
     ]
     found = refined(Planes(), views, truth)
     assert np.abs(found.poses[:, :3, 3] - truth[:, :3, 3]).max() < 0.01
+
+
+def test_clouds_in_the_coordinates_of_a_site_take_part():
+    """Far from their origin, and with the same pose: only their points are at other places."""
+    views, truth = peaks_views(0.05, 2)
+    site = np.array([1000.0, 2000.0, 100.0])
+    placed = [
+        CloudFrame.of(se3.transform(T, v.points[::5].astype(float)) + site, index=v.index)
+        for v, T in zip(views[:4], truth, strict=False)
+    ]
+    assert refined(Planes(), placed, np.tile(np.eye(4), (4, 1, 1))).views == 4

@@ -122,12 +122,15 @@ def _fused(view: CloudFrame) -> Viewpoint | None:
     spread, thin, _ = reduced(view, view, spread, _HIDING_POINTS)
     points, origin = thin.points.astype(np.float64), np.asarray(view.origin, np.float64)
     low, high = np.percentile(points, [2, 98], axis=0)
+    ranges = np.linalg.norm(points - origin, axis=1)
+    # From farther away than they extend, hardly any point is far enough behind another.
+    if np.median(ranges) > np.linalg.norm(high - low):
+        return None
     places = np.random.default_rng(0).uniform(low, high, (_PLACES, 3))
     hidden = _hidden_fraction(points - origin, spread)
     others = [_hidden_fraction(points - place, spread) for place in places]
     if hidden > min(_MAX_HIDDEN, float(np.percentile(others, _PLACES_PERCENTILE))):
         return None
-    ranges = np.linalg.norm(points - origin, axis=1)
     return Viewpoint(origin, spread / 2 / max(float(np.median(ranges)), spread))
 
 

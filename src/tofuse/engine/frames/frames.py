@@ -257,7 +257,7 @@ class CloudFrame:
         (3,) position of the sensor in the frame of the points, m.
     shift
         (3,) m, to add to the points, and to the origin, to get the coordinates of their file. Not
-        zero for map coordinates, which exceed the precision of float32; of whole kilometres.
+        zero for map coordinates, which exceed the precision of float32; of whole metres.
     """
 
     index: int
@@ -387,14 +387,14 @@ Frame = RangeFrame | CloudFrame
 
 # The resolution of float32 is coarser than half a millimetre beyond.
 _MAP_COORDINATES_M = 8192.0
-_SHIFT_STEP_M = 1000.0
 _MAX_SAMPLED = 100_000  # points
 
 
 def map_shift(points: NDArray[np.floating]) -> Float64:
     """Return the `shift` (3,) in m to subtract from points (N, 3): zero but for map coordinates.
 
-    By the median of the plausible points, so that no stray point decides it.
+    By the median of the plausible points, so that no stray point decides it. Poses relative to it
+    act near the points, and not by long lever arms.
     """
     sampled = points[:: max(1, len(points) // _MAX_SAMPLED)]
     sampled = sampled[(np.abs(sampled) <= se3.MAX_COORDINATE_M).all(1)]  # false for NaN
@@ -403,7 +403,7 @@ def map_shift(points: NDArray[np.floating]) -> Float64:
     centre = np.median(sampled.astype(np.float64), axis=0)
     if np.abs(centre).max() <= _MAP_COORDINATES_M:
         return np.zeros(3)
-    return np.asarray(np.round(centre / _SHIFT_STEP_M) * _SHIFT_STEP_M)
+    return np.asarray(np.round(centre))
 
 
 def _check_columns(index: int, count: int, columns: Mapping[str, ArrayLike | None]) -> None:

@@ -31,7 +31,7 @@ from tofuse.engine.views import PreparedView
 class Planes(Bounded, RefinementMethod):
     """Moves all clouds to the planes that they share (eq 2.8 with an unknown surface).
 
-    See `refine_clouds`. Views are kept by the motion of the camera; frames in between follow
+    See `refine_clouds`. Views are kept by the motion of their points; frames in between follow
     them. The result is accepted only if the views support each other about as well as before, and
     views that lose support keep their pose relative to their neighbours.
 
@@ -53,18 +53,28 @@ class Planes(Bounded, RefinementMethod):
 
 @dataclass(frozen=True, eq=False)
 class SampledPoints:
-    """Sampled points (n, 3) of a view in its frame, and their median range, m."""
+    """Sampled points (n, 3) of a view in its frame, and their median distance from their centre.
+
+    The position of the sensor is unknown: the origin may be that of a site or a map, which is the
+    same for all views. So views are spaced by the motion of their points.
+    """
 
     index: int
     depth: float
     points: Float64
+    centre: Float64
 
     @classmethod
     def of(cls, view: Frame, max_points: int) -> SampledPoints:
         """Sample at most `max_points` points, at an even stride."""
         points = view.points[:: max(1, -(-len(view) // max_points))].astype(np.float64)
-        depth = float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0
-        return cls(view.index, depth, points)
+        centre = np.median(points, axis=0) if len(points) else np.zeros(3)
+        depth = float(np.median(np.linalg.norm(points - centre, axis=1))) if len(points) else 0.0
+        return cls(view.index, depth, points, centre)
+
+    def placed(self, T_component_view: Float64) -> Float64:
+        """Return the pose (4, 4) by which views are spaced: that of the centre, m."""
+        return T_component_view @ se3.translation(self.centre)
 
 
 class _Planes(Refiner):
@@ -76,7 +86,8 @@ class _Planes(Refiner):
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Refiner.push`."""
-        self._store.push(SampledPoints.of(view, self._options.points), T_component_camera)
+        sampled = SampledPoints.of(view, self._options.points)
+        self._store.push(sampled, sampled.placed(T_component_camera))
 
     def finish(self, graph: PoseGraph, sensors: external_sensors.SensorPriors) -> Refinement:
         """See `Refiner.finish`."""

@@ -128,9 +128,8 @@ class _Relaxation(Refiner):
 
     def push(self, view: Frame, T_component_camera: Float64) -> None:
         """See `Refiner.push`."""
-        self._store.push(
-            plane_refinement.SampledPoints.of(view, self._method.points), T_component_camera
-        )
+        sampled = plane_refinement.SampledPoints.of(view, self._method.points)
+        self._store.push(sampled, sampled.placed(T_component_camera))
 
     def finish(self, graph: PoseGraph, sensors: external_sensors.SensorPriors) -> Refinement:
         """See `Refiner.finish`; rejected if the support decreases."""
