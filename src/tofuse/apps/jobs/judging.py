@@ -411,9 +411,8 @@ class _Keeping:
     frames: dict[int, Frame] = field(default_factory=dict)
 
     def __getattr__(self, name: str) -> Any:
-        if name == "source":  # while a copy is made, it has none yet
-            raise AttributeError(name)
-        return getattr(self.source, name)
+        # Not self.source, which would end up here again while a copy is made and has none yet.
+        return getattr(object.__getattribute__(self, "source"), name)
 
     def read(self, index: int) -> Frame:
         """See `Source.read`."""

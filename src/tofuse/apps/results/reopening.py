@@ -199,9 +199,8 @@ class _Unchanged:
         self._source, self._depths, self._folder = source, depths, folder
 
     def __getattr__(self, name: str) -> Any:
-        if name == "_source":  # while a copy is made, it has none yet
-            raise AttributeError(name)
-        return getattr(self._source, name)
+        # Not self._source, which would end up here again while a copy is made and has none yet.
+        return getattr(object.__getattribute__(self, "_source"), name)
 
     def read(self, index: int) -> Frame:
         """See `Source.read`."""

@@ -298,9 +298,8 @@ class _WithOdometry:
     odometry: Float64 | None
 
     def __getattr__(self, name: str) -> Any:
-        if name == "source":  # while a copy is made, it has none yet
-            raise AttributeError(name)
-        return getattr(self.source, name)
+        # Not self.source, which would end up here again while a copy is made and has none yet.
+        return getattr(object.__getattribute__(self, "source"), name)
 
 
 def with_odometry(recording: Recording, poses: Float64) -> Recording:

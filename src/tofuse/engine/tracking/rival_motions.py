@@ -10,8 +10,8 @@ since an earlier view, as long as nothing refutes it.
 
 The shares of the cells that follow either motion are those of the mixture of both with the largest
 likelihood, over a window of frames. They are counted by solid angle and by area of surface: what is
-near must not win by its size in the image. Where few cells say anything, as many others are
-occluded, noisy or out of view, they are that much smaller a share of the view.
+near must not win by its size in the image. The share of the view is smaller where only some cells
+say anything, because the others are occluded, noisy or out of view.
 """
 
 from __future__ import annotations
