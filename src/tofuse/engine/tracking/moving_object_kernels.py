@@ -302,16 +302,15 @@ def compare(
                     llr[a, b] *= _SELF_OVERLAP
                 continue
             outcome[a, b] = AMBIGUOUS
-            low, high, missing = np.inf, 0.0, 0
+            side = 1.0 if d > 0 else -1.0
+            d, missing = np.inf, 0
             for p in range(max(k - radius, 0), min(k + radius + 1, rows)):
                 for q in range(max(m - radius, 0), min(m + radius + 1, columns)):
                     if other_z[p, q] > 0:
-                        low = min(low, np.float64(other_z[p, q]))
-                        high = max(high, np.float64(other_z[p, q]))
+                        d = min(d, side * (z_proj - np.float64(other_z[p, q])))
                     else:
                         missing += 1
-            d = z_proj - low if d < 0 else z_proj - high
-            if (d < 0) != (z_proj < z_obs) or not d * d > gate * total or 2 * missing > window:
+            if not (d > 0 and d * d > gate * total) or 2 * missing > window:
                 continue
             low, high = depth, depth
             for p in range(max(i - 1, 0), min(i + 2, z.shape[0])):
@@ -321,7 +320,7 @@ def compare(
                         high = max(high, np.float64(z[p, q]))
             if high - low > max(EDGE_JUMP * depth, _EDGE_SIGMAS * np.sqrt(scaled_variance)):
                 continue
-            outcome[a, b] = IN_FRONT if d < 0 else BEHIND
+            outcome[a, b] = IN_FRONT if side < 0 else BEHIND
             llr[a, b] = min(0.5 * (d * d / total - gate), MAX_EVIDENCE)
 
 

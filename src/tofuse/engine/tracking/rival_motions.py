@@ -41,8 +41,8 @@ DELAY = _EVERY * _WINDOW
 _MIN_SHIFT = 1.0
 # Largest log-likelihood ratio of a cell: that of an error of three sigmas.
 _MAX_LLR = 4.5
-_BINS = np.linspace(-_MAX_LLR, _MAX_LLR, 20)
-_CENTRES = 0.5 * (_BINS[1:] + _BINS[:-1])
+_BINS = 19
+_CENTRES = _MAX_LLR * ((2 * np.arange(_BINS) + 1) / _BINS - 1)
 # Width of the squares, in cells, beyond which albedo may differ for other reasons than motion, such
 # as the light of the camera.
 _PATTERN = 9
@@ -56,7 +56,10 @@ _MIN_RESIDUALS = 50
 # Number of cells that share an error, and the log-likelihood ratio to one motion alone above which
 # the mixture counts.
 _CORRELATED_CELLS, _MIN_EVIDENCE = 100, 3.0
-_ITERATIONS = 50
+# Shares of a rival, and the log-likelihood ratio (S, B) of the mixture of both motions to the tracked
+# one alone, for each share and bin.
+_SHARES = np.linspace(0, 1, 201)
+_MIXTURES = np.log1p(_SHARES[:, None] * np.expm1(_CENTRES))
 # Part of a view, without albedo, that must contradict the tracked motion: a rival matters from a
 # quarter on.
 _MIN_PART = 0.125
@@ -225,9 +228,10 @@ class _Tracked:
         ):
             ratios = likelihood_ratios(a, b, *motions, self.scale, outcome)
             used, stride = np.isfinite(ratios), stride_of(a)
-            llr, area = ratios[used], a.z[::stride, ::stride][used].astype(np.float64) ** 2
-            for row, weights in zip(total, (np.ones_like(area), area), strict=True):
-                row += np.histogram(llr, _BINS, weights=weights)[0]
+            bins = ((ratios[used] / _MAX_LLR + 1) * (0.5 * _BINS)).astype(np.intp)
+            bins, area = np.minimum(bins, _BINS - 1), a.z[::stride, ::stride][used].astype(float) ** 2
+            for row, weights in zip(total, (None, area), strict=True):
+                row += np.bincount(bins, weights, _BINS)
         total[1] *= total[0].sum() / max(total[1].sum(), 1e-9)
         return _Evidence(total, visible)
 
@@ -344,10 +348,6 @@ def _local_mean(image: Float32, width: int) -> Float32:
 
 def _share(weights: Float64) -> float:
     """Return the share of the rival by a histogram (B,); 0 without enough evidence."""
-    total, ratios, share = weights.sum(), np.exp(_CENTRES), 0.5
-    if not total:
-        return 0.0
-    for _ in range(_ITERATIONS):
-        share = float(weights @ (share * ratios / (share * ratios + 1 - share)) / total)
-    evidence = weights @ np.log(share * ratios + 1 - share)
-    return share if evidence / _CORRELATED_CELLS > _MIN_EVIDENCE else 0.0
+    evidence = _MIXTURES @ weights
+    best = int(evidence.argmax())
+    return float(_SHARES[best]) if evidence[best] / _CORRELATED_CELLS > _MIN_EVIDENCE else 0.0
