@@ -14,7 +14,7 @@ from tofuse.engine.graph import LoopRecord, PoseGraph, external_sensors, graph_c
 from tofuse.engine.loops import PriorLoop, cut_edges
 from tofuse.engine.mapping import camera_uncertainty
 from tofuse.engine.mapping.config import Config
-from tofuse.engine.mapping.frame_log import FrameLog
+from tofuse.engine.mapping.frame_log import Entry, FrameLog
 from tofuse.engine.mapping.observations import CheckedImage, Observations
 from tofuse.engine.mapping.tracked_graph import Optimised, Refined, TrackedGraph
 from tofuse.engine.parts import name_of
@@ -55,6 +55,41 @@ class Assessed:
     model: Model
 
 
+@dataclass(frozen=True)
+class _Motion:
+    """Frames in which the tracker noticed that something moves, or fits badly.
+
+    Attributes
+    ----------
+    moving, rivals
+        Index, and the share of the view that moves; or that follows a rival of the tracked motion.
+    moved
+        Those in which outlines show that objects moved.
+    doubtful
+        Those with an unusual fit.
+    """
+
+    moving: tuple[tuple[int, float], ...]
+    rivals: tuple[tuple[int, float], ...]
+    moved: tuple[int, ...]
+    doubtful: tuple[int, ...]
+
+    @classmethod
+    def of(cls, posed: Sequence[Entry]) -> _Motion:
+        steps = [(e.record.index, e.step) for e in posed if e.step is not None]
+        return cls(
+            tuple((e.record.index, e.moving_fraction) for e in posed if e.moving_fraction > 0),
+            tuple((k, step.rival) for k, step in steps if step.rival > 0),
+            tuple(k for k, step in steps if step.moved > moving_objects.MIN_MOVING_FRACTION),
+            tuple(k for k, step in steps if step.doubtful),
+        )
+
+    @property
+    def shares(self) -> list[tuple[int, float]]:
+        """All shares of views, by frame index."""
+        return [*self.moving, *self.rivals]
+
+
 @dataclass(frozen=True, eq=False)
 class Assessment:
     """Assesses the reconstruction of one connected part.
@@ -93,42 +128,30 @@ class Assessment:
         components
             As in `Reconstruction`.
         """
-        graph, observations = refined.graph, self.observations
-        loops = tuple(c.record for c in closed.loops)
+        graph = refined.graph
         cross_view = self._cross_view(graph)
         accuracy, covariances = self._accuracy(closed, refined, model, cross_view)
-        rms_m = np.nan if cross_view is None else cross_view.rms_m()
-        check, corrections = refined.refinement.calibration_check, self._estimated_corrections
-        accuracy = replace(
-            accuracy,
-            camera_sigmas={} if check is None else camera_uncertainty.sigmas(check, corrections),
-            surface_m=rms_m if np.isfinite(rms_m) else None,
-        )
-        moving = tuple(
-            (e.record.index, e.moving_fraction) for e in self.tracked.posed if e.moving_fraction > 0
-        )
-        posed_steps = [(e.record.index, e.step) for e in self.tracked.posed if e.step is not None]
-        moved = tuple(
-            k for k, step in posed_steps if step.moved > moving_objects.MIN_MOVING_FRACTION
-        )
-        rivals = tuple((k, step.rival) for k, step in posed_steps if step.rival > 0)
+        accuracy = self._with_camera(accuracy, refined.refinement, cross_view)
+        motion = _Motion.of(self.tracked.posed)
+        measured = self._measured_steps(closed.sensors)
+        confirmed = self._confirmed(graph, motion, measured)
         ambiguous = self._ambiguous(graph)
-        indices = [e.record.index for e in self.log.entries]
-        repeated = frame_ranges.runs_of(indices, self.log.repeated)
-        changes = refined.refinement.range_change is not None
-        sensors = closed.sensors
-        measured = frozenset(s.j for s in sensors.steps) if sensors.verified else frozenset[int]()
-        confirmed = self._confirmed(graph, moving, rivals, measured)
-        is_open = checks.open_motion([*moving, *rivals], measured | confirmed)
-        if ambiguous or changes or is_open or checks.frozen(repeated):
+        if (
+            ambiguous
+            or refined.refinement.range_change is not None
+            or checks.open_motion(motion.shares, measured | confirmed)
+            or checks.frozen(self._repeated)
+        ):
             accuracy = accuracy.without_bound()
-        if observations.has_covariances:
+        if self.observations.has_covariances:
             model = self._with_pose_errors(model, graph, covariances)
         records = self._records(covariances)
-        posed, entries = self.tracked.posed, self.log.entries
+        loops = tuple(c.record for c in closed.loops)
         evidence = checks.Evidence(
             records=records,
-            registrations=tuple(None if e.step is None else e.step.registration for e in entries),
+            registrations=tuple(
+                None if e.step is None else e.step.registration for e in self.log.entries
+            ),
             loops=loops,
             sequential=closed.visual.sequential if self._is_tracked else graph.poses,
             optimisation=closed.visual.optimisation,
@@ -136,26 +159,22 @@ class Assessment:
             accuracy=accuracy,
             diagonal_m=model.cloud.diagonal_m,
             tolerance_m=self.config.tolerance_m,
-            has_covariances=observations.has_covariances,
+            has_covariances=self.observations.has_covariances,
             refinement=refined.refinement,
             given_loops=frozenset((g.i, g.j) for g in self.prior_loops if g.by_user),
-            depths=tuple(
-                d
-                for index, d in observations.depths.items()
-                if d > 0 and index in self.tracked.poses
-            ),
-            ambiguity_m=observations.ambiguity_m,
-            scans=model.mesh is None and observations.model.surface,
+            depths=self._depths,
+            ambiguity_m=self.observations.ambiguity_m,
+            scans=model.mesh is None and self.observations.model.surface,
             repeated=tuple(self.log.repeated),
             interruptions=tuple(self.log.interruptions),
             priors=closed.sensors.records,
             components=components,
-            moving=moving,
-            moved=moved,
-            rivals=rivals,
+            moving=motion.moving,
+            moved=motion.moved,
+            rivals=motion.rivals,
             measured=measured,
             confirmed=confirmed,
-            doubtful=tuple(e.record.index for e in posed if e.step is not None and e.step.doubtful),
+            doubtful=motion.doubtful,
             single_link_frames=single_link_frames(self.tracked, loops),
             ambiguous=ambiguous,
         )
@@ -169,6 +188,36 @@ class Assessment:
     @property
     def _is_tracked(self) -> bool:
         return not isinstance(self.config.odometry, given.GivenPoses)
+
+    @property
+    def _repeated(self) -> Sequence[frame_ranges.Range]:
+        """Ranges of frames whose image equals the one before."""
+        return frame_ranges.runs_of([e.record.index for e in self.log.entries], self.log.repeated)
+
+    @property
+    def _depths(self) -> tuple[float, ...]:
+        """Median depths of the frames of this part, m."""
+        depths = self.observations.depths.items()
+        return tuple(d for index, d in depths if d > 0 and index in self.tracked.poses)
+
+    def _measured_steps(self, sensors: external_sensors.SensorPriors) -> frozenset[int]:
+        """Return the frames to which verified odometry measures the step."""
+        return frozenset(s.j for s in sensors.steps) if sensors.verified else frozenset()
+
+    def _with_camera(
+        self,
+        accuracy: pose_accuracy.Accuracy,
+        refinement: Refinement,
+        cross_view: cross_view_agreement.CrossViewConsistency | None,
+    ) -> pose_accuracy.Accuracy:
+        """Add the uncertainty of the camera's parameters and of the surface."""
+        check, corrections = refinement.calibration_check, self._estimated_corrections
+        rms_m = np.nan if cross_view is None else cross_view.rms_m()
+        return replace(
+            accuracy,
+            camera_sigmas={} if check is None else camera_uncertainty.sigmas(check, corrections),
+            surface_m=rms_m if np.isfinite(rms_m) else None,
+        )
 
     def _accuracy(
         self,
@@ -299,21 +348,17 @@ class Assessment:
         return cross_view_agreement.compare_views(views, poses) if len(views) > 1 else None
 
     def _confirmed(
-        self,
-        graph: PoseGraph,
-        moving: Sequence[tuple[int, float]],
-        rivals: Sequence[tuple[int, float]],
-        measured: frozenset[int],
+        self, graph: PoseGraph, motion: _Motion, measured: frozenset[int]
     ) -> frozenset[int]:
         """Return the frames in which much moves, and whose poses the background confirms."""
-        open_frames = checks.open_motion([*moving, *rivals], measured)
+        open_frames = checks.open_motion(motion.shares, measured)
         if not open_frames:
             return frozenset()
-        excluded = {k: x for k, x in moving if x > moving_objects.MIN_MOVING_FRACTION}
-        rival = dict(rivals)
+        moving, rivals = dict(motion.moving), dict(motion.rivals)
+        excluded = {k: x for k, x in moving.items() if x > moving_objects.MIN_MOVING_FRACTION}
         movements = {
-            k: background.Movement(excluded.get(k, 0.0), rival.get(k, 0.0))
-            for k in excluded.keys() | rival.keys()
+            k: background.Movement(excluded.get(k, 0.0), rivals.get(k, 0.0))
+            for k in excluded.keys() | rivals.keys()
         }
         limits = background.Limits(checks.MAX_MOVING, rival_motions.DELAY)
         views, poses = self._checked_views(graph, with_open=True)

@@ -8,13 +8,14 @@ from functools import cached_property
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64
+from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import Measured, Optimisation, PoseGraph, build_graph, external_sensors
 from tofuse.engine.loops import ClosedLoop, Join
 from tofuse.engine.mapping.frame_log import Entry
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.refinement import Refinement
+from tofuse.engine.results import FrameRecord
 from tofuse.engine.stored_views import ViewStore
 from tofuse.engine.tracking import motion_prediction
 from tofuse.engine.views import PreparedView
@@ -70,47 +71,18 @@ class TrackedGraph:
         tracked = np.array([self.poses[index] for index in ids])
         poses = tracked if refinement is None else refinement.poses
         refined_edges = () if refinement is None else refinement.edges
-        refined_frames = {index for edge in refined_edges for index in (edge.i, edge.j)}
-        position_of = {index: k for k, index in enumerate(ids)}
-        unobservable = [e.record.unobservable for e in self.posed]
-        degenerate_run_of = motion_prediction.degenerate_runs(unobservable)
-        prediction = (
-            motion_prediction.Prediction.of(tracked, unobservable)
-            if degenerate_run_of.any()
-            else None
-        )
-        if prediction is not None and conservative:
-            prediction = prediction.with_max_growth()
-        times = {e.record.index: e.record.timestamp for e in self.posed}
-        interval = float(np.median(np.diff(list(times.values())))) if len(times) > 1 else 0.0
-        sequential_edges = []
-        for entry in self.posed:
-            step, index = entry.step, entry.record.index
-            if step is None or step.reference is None or step.registration is None:
-                continue
-            if {step.reference, index} <= refined_frames:
-                continue
-            r = step.registration
-            # The prediction error grows with the square of the elapsed time.
-            n_frames = abs(position_of[index] - position_of[step.reference])
-            elapsed = abs(times[index] - times[step.reference])
-            time_ratio = (
-                max(elapsed / (n_frames * interval), 1.0) if n_frames and interval > 0 else 1.0
-            )
-            information = r.information
-            if index in confirmed:
-                information = information * step.inflation**2
-            if prediction is not None:
-                sigma = prediction.error(int(degenerate_run_of[position_of[index]]), n_frames)
-                predicted_sigma = (sigma[0] * time_ratio**2, sigma[1] * time_ratio**2)
-                information = motion_prediction.with_prediction(
-                    information, r.unobservable, predicted_sigma
-                )
-            sequential_edges.append(Measured(step.reference, index, r.T_target_source, information))
+        refined = {index for edge in refined_edges for index in (edge.i, edge.j)}
+        predicted = _PredictedMotion([e.record for e in self.posed], tracked, conservative)
+        sequential_edges = [
+            edge
+            for entry in self.posed
+            if (edge := _sequential_edge(entry, predicted, confirmed)) is not None
+            and not {edge.i, edge.j} <= refined
+        ]
         join_edges = [
             Measured(j.link.i, j.link.j, j.link.T_i_j, j.link.information)
             for j in self.joins
-            if j.defines_pose and not {j.link.i, j.link.j} <= refined_frames
+            if j.defines_pose and not {j.link.i, j.link.j} <= refined
         ]
         loop_edges = [
             Measured(c.record.i, c.record.j, c.T_i_j, c.information)
@@ -190,6 +162,62 @@ class TrackedGraph:
     def gaps(self) -> set[tuple[int, int]]:
         """The frames before and after the gaps that no registration closes."""
         return {(j.link.i, j.link.j) for j in self.joins if j.kind != "links"}
+
+
+@dataclass(frozen=True, eq=False)
+class _PredictedMotion:
+    """What the prediction alone says about the motion between two of consecutive frames.
+
+    `conservative` is that of `TrackedGraph.build`.
+    """
+
+    records: Sequence[FrameRecord]
+    poses: Float64
+    conservative: bool
+
+    @cached_property
+    def _error_model(self) -> motion_prediction.Prediction:
+        unobservable = [r.unobservable for r in self.records]
+        model = motion_prediction.Prediction.of(self.poses, unobservable)
+        return model.with_max_growth() if self.conservative else model
+
+    @cached_property
+    def _positions(self) -> dict[int, int]:
+        return {r.index: k for k, r in enumerate(self.records)}
+
+    @cached_property
+    def _degenerate_runs(self) -> Intp:
+        return motion_prediction.degenerate_runs([r.unobservable for r in self.records])
+
+    @cached_property
+    def _interval(self) -> float:
+        return float(np.median(np.diff([r.timestamp for r in self.records])))
+
+    def sigma(self, i: int, j: int) -> tuple[float, float]:
+        """Return sigma (m, rad) of the motion from frame i to frame j along a degenerate axis."""
+        first, last = self._positions[i], self._positions[j]
+        frames = abs(last - first)
+        m, rad = self._error_model.error(int(self._degenerate_runs[last]), frames)
+        # It grows with the square of the elapsed time.
+        elapsed = abs(self.records[last].timestamp - self.records[first].timestamp)
+        usual = frames * self._interval
+        ratio = max(elapsed / usual, 1.0) if usual > 0 else 1.0
+        return m * ratio**2, rad * ratio**2
+
+
+def _sequential_edge(
+    entry: Entry, predicted: _PredictedMotion, confirmed: Collection[int]
+) -> Measured | None:
+    """Return the edge by which a frame was tracked; None if it was not registered."""
+    step, index = entry.step, entry.record.index
+    if step is None or step.reference is None or step.registration is None:
+        return None
+    r = step.registration
+    information = r.information * (step.inflation**2 if index in confirmed else 1.0)
+    if len(r.unobservable):
+        sigma = predicted.sigma(step.reference, index)
+        information = motion_prediction.with_prediction(information, r.unobservable, sigma)
+    return Measured(step.reference, index, r.T_target_source, information)
 
 
 @dataclass(frozen=True, eq=False)

@@ -158,7 +158,7 @@ class CalibrationCheck:
             return {}
         if not self.large and not self.improves:
             return {}
-        return {n: e for n, e in self.errors.items() if abs(e) > self._limit(n)}
+        return {n: e for n, e in self.errors.items() if abs(e) > self.limit(n)}
 
     @property
     def is_likely(self) -> bool:
@@ -173,10 +173,28 @@ class CalibrationCheck:
     @property
     def large(self) -> dict[str, float]:
         """Significant errors that exceed the calibration error of usual cameras."""
-        return {n: e for n, e in self.errors.items() if _large(n, e, self._limit(n))}
+        return {n: e for n, e in self.errors.items() if _large(n, e, self.limit(n))}
 
-    def _limit(self, name: str) -> float:
+    @property
+    def confirmed_by_loop(self) -> bool:
+        """Whether the gap of a loop confirms the error `best`, or allows for it.
+
+        Multipath looks like a smaller focal length or offset, with which views agree better: a loop
+        must confirm that. The others hardly change it, as their drift resembles any other.
+        """
+        if self.gap is None:
+            return False
+        return self.gap.confirms if self.best in _REVEALED_BY_LOOP else not self.gap.grows
+
+    def limit(self, name: str) -> float:
+        """Return the size of an error from which it is significant."""
         return self.significance * self.sigmas.get(name, np.inf)
+
+    def with_errors(self, errors: Mapping[str, float], first: _FirstEstimates) -> CalibrationCheck:
+        """Return the check with these errors, and the deviations of their first estimates."""
+        names = [name for name in _INDEX if name in errors]
+        sigmas = {name: first.sigmas[name] for name in names}
+        return replace(self, errors={name: errors[name] for name in names}, sigmas=sigmas)
 
 
 def _determined(name: str, sigma: float) -> bool:
@@ -190,80 +208,79 @@ def _large(name: str, error: float, limit: float, factor: float = 1.0) -> bool:
 
 def check_calibration(aligned: RefinedViews) -> CalibrationCheck:
     """Estimate the errors of the camera from views that were refined without such errors."""
-    refined, count = aligned.refined, len(aligned.views)
-    if not len(refined.pairs):
+    if not len(aligned.refined.pairs):
         return CalibrationCheck()
     first = _FirstEstimates.of(aligned)
-    significance = significance_of(count)
-    if count < _MIN_VIEWS:
+    without_error = _by_first_estimates(aligned, first)
+    if len(aligned.views) < _MIN_VIEWS or without_error.range_change is not None:
+        return without_error
+    likely = [name for name in first.determined if first.is_likely(name)]
+    if not likely:
+        return _check_by_loop(aligned, first, without_error)
+    return _check_likely(aligned, first, without_error, likely)
+
+
+def _by_first_estimates(aligned: RefinedViews, first: _FirstEstimates) -> CalibrationCheck:
+    """Return what is known of the camera before any error is estimated in full."""
+    significance = significance_of(len(aligned.views))
+    if len(aligned.views) < _MIN_VIEWS:
         return CalibrationCheck(motion=first.motion, significance=significance)
-    without_error = CalibrationCheck(
+    check = CalibrationCheck(
         focal_sigma=first.sigmas["focal"],
         estimates={name: (first.errors[name], first.sigmas[name]) for name in _INDEX},
         motion=first.motion,
         moved=first.largest_motion(significance),
         significance=significance,
     )
-    if first.change is not None:
-        changed = range_change(first.change, aligned)
-        if changed is not None and changed.is_large:
-            return replace(without_error, range_change=changed)
-        if (changed or first.change).is_significant:
-            ratio = abs(changed.change / first.change.scale) if changed else 1.0
-            m, rad = first.change_motion
-            without_error = replace(
-                without_error,
-                changed=(ratio * m, ratio * rad),
-                change_confirmed=changed is None or changed.confirmed,
-            )
-    likely = [name for name in first.determined if first.is_likely(name)]
-    if not likely:
-        return _check_by_loop(aligned, first, without_error)
+    if first.change is None:
+        return check
+    changed = range_change(first.change, aligned)
+    if changed is not None and changed.is_large:
+        return replace(check, range_change=changed)
+    if not (changed or first.change).is_significant:
+        return check
+    ratio = abs(changed.change / first.change.scale) if changed else 1.0
+    m, rad = first.change_motion
+    confirmed = changed is None or changed.confirmed
+    return replace(check, changed=(ratio * m, ratio * rad), change_confirmed=confirmed)
+
+
+def _check_likely(
+    aligned: RefinedViews,
+    first: _FirstEstimates,
+    without_error: CalibrationCheck,
+    likely: Sequence[str],
+) -> CalibrationCheck:
+    """Estimate likely errors in full, and check whether views, loops and odometry confirm them."""
     estimator = _Estimator(aligned, first)
     # Errors are correlated: in a joint estimate, the true one remains.
-    subsets = [[name] for name in likely] + ([likely] if len(likely) > 1 else [])
+    subsets = [[name] for name in likely] + ([list(likely)] if len(likely) > 1 else [])
     # In parallel, as solving for the poses is serial.
     found = run_all([partial(estimator.estimate, names) for names in subsets])
     estimates, joint = dict(zip(likely, found, strict=False)), found[-1]
     best_name = max(likely, key=lambda name: abs(joint.errors[_INDEX[name]]) / TOLERANCES[name])
     best = estimates[best_name]
-    errors = {name: float(e.errors[_INDEX[name]]) for name, e in estimates.items()}
-    limits = {name: significance * first.sigmas[name] for name in errors}
-    large = any(_large(name, error, limits[name]) for name, error in errors.items())
-    certain = abs(errors[best_name]) > limits[best_name]
-    support, with_best = estimator.support_of(best)
-    improves = certain and with_best - support > _SUPPORT_NOISE
-    gap = None
-    if large or improves:
-        gap = loop_gap(aligned, best.poses, best.errors)
-    contradicted = (large or improves) and estimator.is_contradicted(best)
-    # Multipath looks like a smaller focal length or offset, with which views agree better: a loop
-    # must confirm that. The others hardly change it, as their drift resembles any other.
-    by_loop = gap is not None and (
-        gap.confirms if best_name in _REVEALED_BY_LOOP else not gap.grows
-    )
-    alarm = large and improves and by_loop and not contradicted
-    if alarm:  # alternative explanations
-        for name in first.determined:
-            if name not in errors:
-                errors[name] = float(estimator.estimate([name]).errors[_INDEX[name]])
-    elif not contradicted:
-        of_loop = _check_by_loop(aligned, first, without_error)
-        if of_loop.alarm:
-            return of_loop
     # Estimated together, correlated errors may be large and opposite.
-    largest = max(rms_motion(refined.poses, e.poses) for e in estimates.values())
-    return replace(
+    largest = max(rms_motion(aligned.refined.poses, e.poses) for e in estimates.values())
+    check = replace(
         without_error,
-        alarm=alarm,
-        errors={name: errors[name] for name in _INDEX if name in errors},
-        sigmas={name: first.sigmas[name] for name in _INDEX if name in errors},
-        support=(support, with_best),
-        gap=gap,
+        support=estimator.support_of(best),
         best=best_name,
-        moved=max(largest, first.largest_motion(significance)),
-        contradicted=contradicted,
-    )
+        moved=max(largest, without_error.moved),
+    ).with_errors({name: float(e.errors[_INDEX[name]]) for name, e in estimates.items()}, first)
+    certain = abs(check.errors[best_name]) > check.limit(best_name)
+    improves = certain and check.improves
+    if check.large or improves:
+        gap = loop_gap(aligned, best.poses, best.errors)
+        check = replace(check, gap=gap, contradicted=estimator.is_contradicted(best))
+    if check.contradicted:
+        return check
+    if check.large and improves and check.confirmed_by_loop:  # alternative explanations
+        others = [name for name in first.determined if name not in check.errors]
+        more = {name: float(estimator.estimate([name]).errors[_INDEX[name]]) for name in others}
+        return replace(check.with_errors(check.errors | more, first), alarm=True)
+    of_loop = _check_by_loop(aligned, first, without_error)
+    return of_loop if of_loop.alarm else check
 
 
 @dataclass(frozen=True, eq=False)

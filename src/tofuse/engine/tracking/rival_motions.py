@@ -229,7 +229,10 @@ class _Tracked:
             ratios = likelihood_ratios(a, b, *motions, self.scale, outcome)
             used, stride = np.isfinite(ratios), stride_of(a)
             bins = ((ratios[used] / _MAX_LLR + 1) * (0.5 * _BINS)).astype(np.intp)
-            bins, area = np.minimum(bins, _BINS - 1), a.z[::stride, ::stride][used].astype(float) ** 2
+            bins, area = (
+                np.minimum(bins, _BINS - 1),
+                a.z[::stride, ::stride][used].astype(float) ** 2,
+            )
             for row, weights in zip(total, (None, area), strict=True):
                 row += np.bincount(bins, weights, _BINS)
         total[1] *= total[0].sum() / max(total[1].sum(), 1e-9)
