@@ -22,7 +22,7 @@ from tofuse.engine.mapping.trial import RUNS, Prepare, trial
 from tofuse.engine.noise import NOISE, NoiseModel, noise_model_for
 from tofuse.engine.parts import name_of
 from tofuse.engine.progress import Progress, Silent
-from tofuse.engine.sensor import Correction, Noise
+from tofuse.engine.sensor import Correction, Corrector, Noise
 from tofuse.engine.stopwatch import timing
 from tofuse.engine.tracking import Keyframes, given
 from tofuse.engine.views import RAW_RANGE_FALLOFF
@@ -174,14 +174,16 @@ def _after_trial(
 ) -> Config:
     """Return the configuration after the trial of a correction."""
     others = replace(config, corrections=tuple(c for c in config.corrections if c is not item))
-    uncorrected, corrected = _preparation(others), _preparation(config)
+    correctors = [c.start() for c in config.corrections]
+    uncorrected, corrected = _preparation(others), _preparation(config, correctors)
+    corrector = correctors[config.corrections.index(item)]
     if _changes(config, recording, uncorrected, corrected):
         result = trial(recording, uncorrected, corrected, runs)
-        tested = item.after_trial(result.improves, result.strength, result.error)
+        tested = item.after_trial(corrector, result.improves, result.strength, result.error)
         if tested.disabled:
             progress.note(f"correction {name_of(item)} not applied: {result.in_words()}")
     else:
-        tested = item.after_trial(improves=True)
+        tested = item.after_trial(corrector, improves=True)
     corrections = tuple(tested if c is item else c for c in config.corrections)
     return replace(config, corrections=corrections)
 
@@ -202,9 +204,14 @@ def _changes(
     return not np.array_equal(before.depth, after.depth)
 
 
-def _preparation(config: Config) -> Prepare:
-    """Return the corrections and filters of single frames, without filters over time."""
-    steps = [*map(_correcting, config.corrections), *map(_filtering, config.filters)]
+def _preparation(config: Config, correctors: Sequence[Corrector] | None = None) -> Prepare:
+    """Return the corrections and filters of single frames, without filters over time.
+
+    `correctors` are those of the configuration's corrections if they have been started.
+    """
+    if correctors is None:
+        correctors = [correction.start() for correction in config.corrections]
+    steps = [*(c.apply for c in correctors), *map(_filtering, config.filters)]
 
     def prepare(frame: Frame) -> Frame:
         for step in steps:

@@ -92,12 +92,18 @@ class Correction(Protocol):
         return False
 
     def after_trial(
-        self, improves: bool, strength: float = float("nan"), error: float = float("inf")
+        self,
+        corrector: Corrector,
+        improves: bool,
+        strength: float = float("nan"),
+        error: float = float("inf"),
     ) -> Correction:
         """Return the correction with the outcome of a trial.
 
         Parameters
         ----------
+        corrector
+            Has corrected the views of the trial.
         improves
             Whether it is to be used.
         strength, error

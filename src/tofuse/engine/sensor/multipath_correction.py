@@ -35,7 +35,8 @@ class Multipath(Bounded, Correction):
     ----------
     gain
         Raw amplitude, in counts, of a white wall (albedo 1) at 1 m on the optical axis; for
-        range-compensated amplitude, of a white wall anywhere. None: estimated from the recording.
+        range-compensated amplitude, of a white wall anywhere. None: estimated from the recording,
+        by the views of the trial if there is one.
     period_m
         Ambiguity range; None: that of the frame.
     bounces
@@ -83,25 +84,27 @@ class Multipath(Bounded, Correction):
         return not self.applied
 
     def after_trial(
-        self, improves: bool, strength: float = float("nan"), error: float = float("inf")
+        self,
+        corrector: Corrector,
+        improves: bool,
+        strength: float = float("nan"),
+        error: float = float("inf"),
     ) -> Multipath:
-        """See `Correction.after_trial`.
+        """See `Correction.after_trial`. The gain is that of the trial's views.
 
         The correction is not scaled by the strength, whose estimate is biased low
         (`mapping.trial`), while the gain has been estimated from the recording. Its standard error
         is added to `relative_sigma`.
         """
+        decided = replace(self, trial=False, applied=improves)
         if not np.isfinite([strength, error]).all():
-            return replace(self, trial=False, applied=improves)
-        relative_sigma = (
-            float(np.hypot(self.relative_sigma, error / strength))
-            if improves
-            else self.relative_sigma
-        )
-        outcome = (float(strength), float(error))
-        return replace(
-            self, trial=False, applied=improves, strength=outcome, relative_sigma=relative_sigma
-        )
+            return decided
+        decided = replace(decided, strength=(float(strength), float(error)))
+        if not improves:
+            return decided
+        assert isinstance(corrector, MultipathCorrector)
+        relative_sigma = float(np.hypot(self.relative_sigma, error / strength))
+        return replace(decided, gain=corrector.gain, relative_sigma=relative_sigma)
 
     def start(self, model: MultipathModel | None = None) -> MultipathCorrector:
         """See `Correction.start`. `model` computes the multipath."""

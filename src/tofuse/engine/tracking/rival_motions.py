@@ -56,8 +56,8 @@ _MIN_RESIDUALS = 50
 # Number of cells that share an error, and the log-likelihood ratio to one motion alone above which
 # the mixture counts.
 _CORRELATED_CELLS, _MIN_EVIDENCE = 100, 3.0
-# Shares of a rival, and the log-likelihood ratio (S, B) of the mixture of both motions to the tracked
-# one alone, for each share and bin.
+# Shares of a rival, and the log-likelihood ratio (S, B) of the mixture of both motions to the
+# tracked one alone, for each share and bin.
 _SHARES = np.linspace(0, 1, 201)
 _MIXTURES = np.log1p(_SHARES[:, None] * np.expm1(_CENTRES))
 # Part of a view, without albedo, that must contradict the tracked motion: a rival matters from a
