@@ -296,6 +296,17 @@ def test_odometry_from_the_same_depth_is_no_evidence():
     assert len(exact.steps) == N - 1
 
 
+def test_odometry_with_known_errors_counts_where_the_path_rests_on_it():
+    graph = tracked(truth(), 0 * NODDING)
+    same = sensed(odometer(graph.poses, 0.0005))
+    known = measure_all((OdometryEdges(scale=0.5),), same, graph)
+    assert len(known.steps) == N - 1
+    assert known.verified
+    assert known.records[0].scale == 0.5
+    stated = measure_all((OdometryEdges(scale=1.0),), same, graph)
+    np.testing.assert_allclose(known.steps[3].information, 4 * stated.steps[3].information)
+
+
 def test_missing_sensors_change_nothing():
     graph = tracked(truth(), NODDING)
     measured = measure_all((GravityEdges(), OdometryEdges()), sensed(), graph)

@@ -14,10 +14,12 @@ from tofuse.apps.results.output import write_result
 from tofuse.engine.arrays import Float64
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion.options import Fusion
+from tofuse.engine.graph.external_sensors import OdometryEdges
 from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.search.search_grid import SearchOptions
+from tofuse.formats.poses.trajectory import write_tum
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import Opening
 
@@ -75,11 +77,20 @@ def recorded(folder: Path, frames: Iterable[RangeFrame]) -> Path:
     return folder
 
 
-def made_result_of(folder: Path, frames: Sequence[RangeFrame]) -> Path:
-    """Record these frames beside `folder`, and write the result of a run into it."""
+def made_result_of(
+    folder: Path, frames: Sequence[RangeFrame], odometry: Float64 | None = None
+) -> Path:
+    """Record these frames beside `folder`, and write the result of a run into it.
+
+    Optionally with recorded odometry (N, 4, 4), which the path then rests on.
+    """
     recording = recorded(folder.with_name(f"{folder.name}-recording"), frames)
+    config = quick()
+    if odometry is not None:
+        write_tum(recording / "odometry.txt", np.arange(len(frames)) / 10, odometry)
+        config = replace(config, priors=(*config.priors, OdometryEdges()))
     opening = Opening((recording,))
-    result = reconstruct(opening.open(), quick(), threads=2)
+    result = reconstruct(opening.open(), config, threads=2)
     about = {**result.recording, "opening": opening.to_dict()}
     write_result(replace(result, recording=about), OutputFolder(folder))
     return folder

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 import made_sessions
-from made_sessions import quick
+from made_rooms import seen
+from made_sessions import made_result_of, quick
 from tofuse.apps.cli.program import main
 from tofuse.apps.export.exporting import export
 from tofuse.apps.jobs import merging
-from tofuse.apps.jobs.merging import merge_sessions, merged_config
+from tofuse.apps.jobs.merging import joined_recording, merge_sessions, merged_config
 from tofuse.apps.jobs.running import exit_status
 from tofuse.apps.jobs.sessions import read_sessions
 from tofuse.apps.report.session_words import session_sentences
@@ -26,6 +27,7 @@ from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion import texture
 from tofuse.engine.fusion.texture import textured
 from tofuse.engine.geometry import se3
+from tofuse.engine.graph.external_sensors import OdometryEdges
 from tofuse.engine.progress import Silent
 from tofuse.formats.geometry import read_textured_glb
 from tofuse.formats.poses.trajectory import read_tum, write_tum
@@ -87,6 +89,21 @@ def test_overlap_and_probability_are_reported(both) -> None:
     (text,) = session_sentences(both)
     assert "overlap" in text
     assert "probability" in text
+
+
+def test_odometry_that_one_path_rests_on_counts_in_the_map(session_results, tmp_path) -> None:
+    frames = [seen(T, 100 + k) for k, T in enumerate(HERE)]
+    with_odometry = made_result_of(tmp_path / "here", frames, np.array(HERE))
+    sessions = read_sessions([with_odometry, session_results["there"]], 2, Silent())
+    (used,) = [p for p in merged_config(sessions).priors if isinstance(p, OdometryEdges)]
+    assert used.scale is not None
+    recording, _ = joined_recording(sessions)
+    assert recording.odometry is not None
+    np.testing.assert_allclose(recording.odometry[:N], HERE, atol=1e-6)
+    assert np.isnan(recording.odometry[N:]).all()
+    found = merge_sessions(sessions, quick_merge(sessions), threads=2)
+    (record,) = [p for p in found.diagnostics.priors if p.sensor == "odometry"]
+    assert (record.measured, record.used) == (N - 1, N - 1)
 
 
 def test_run_json_states_session_of_each_frame(both, session_results) -> None:

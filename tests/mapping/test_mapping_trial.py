@@ -70,6 +70,7 @@ def test_compensation_is_kept_with_multipath() -> None:
     assert part.strength is not None
     strength, error = part.strength
     assert 0.2 < strength < 1
+    assert part.gain is not None  # one for all frames
     # The uncertainty of the strength is part of each pixel's error.
     assert part.relative_sigma == pytest.approx(
         math.hypot(Multipath().relative_sigma, error / strength)

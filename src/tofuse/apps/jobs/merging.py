@@ -27,6 +27,7 @@ from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.frames import Recording, Source
 from tofuse.engine.fusion import Textured
 from tofuse.engine.geometry import se3
+from tofuse.engine.graph import external_sensors
 from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping import Config, Mapper, from_method, reconstructing
 from tofuse.engine.parts import check_number
@@ -96,10 +97,17 @@ def merge(
 
 
 def merged_config(sessions: Sequence[Session]) -> Config:
-    """Return the configuration of a merge: the default, with the model options of the first."""
+    """Return the configuration of a merge: the default, with the model options of the first.
+
+    And with the external sensors of all, unless one of them used none.
+    """
     first = sessions[0].config
     default = from_method("default")
-    priors = default.priors if all(s.config.priors for s in sessions) else ()
+    sensors = [p for s in sessions for p in s.config.priors]
+    priors = {type(p): p for p in sensors}
+    odometry = [p for p in sensors if isinstance(p, external_sensors.OdometryEdges)]
+    if odometry:  # the least accurate
+        priors[external_sensors.OdometryEdges] = max(odometry, key=lambda p: p.scale or 0)
     searches = _SEARCHES * (len(sessions) - 1)
     joining = replace(
         default.joining,
@@ -116,7 +124,7 @@ def merged_config(sessions: Sequence[Session]) -> Config:
         odometry=first.odometry,
         fusion=first.fusion,
         tolerance_m=first.tolerance_m,
-        priors=priors,
+        priors=tuple(priors.values()) if all(s.config.priors for s in sessions) else (),
         joining=joining,
         self_calibration=False,  # done for each session
     )

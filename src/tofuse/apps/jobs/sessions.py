@@ -13,6 +13,7 @@ from tofuse.apps.results import folders, reopening, run_json
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
+from tofuse.engine.graph import external_sensors
 from tofuse.engine.mapping import Config, adaptation, kind_of
 from tofuse.engine.progress import Progress
 from tofuse.engine.tracking import Keyframes, Status, given
@@ -110,8 +111,9 @@ def sessions_of(
         parts = list(reopening.stored_recordings(folder, run))
         posed = [{k: stated[part.first + k] for k in part.frames} for part in parts]
         links = _links(run, parts)
+        odometry_scale = _odometry_scale(run)
     sessions = [
-        _session(part, poses, folder, threads, progress)
+        _session(part, poses, odometry_scale, folder, threads, progress)
         for part, poses in zip(parts, posed, strict=True)
     ]
     return [replace(sessions[0], links=links), *sessions[1:]]
@@ -126,9 +128,18 @@ def _links(
     return tuple((i, j) for i, j in loops if bisect_right(starts, i) != bisect_right(starts, j))
 
 
+def _odometry_scale(run: Mapping[str, Any]) -> float | None:
+    """Return the factor on the errors of the odometry that a path rests on; None if it doesn't."""
+    records = (external_sensors.SensorRecord(**p) for p in run["priors"])
+    used = [r for r in records if r.sensor == "odometry" and r.used]
+    reliable = external_sensors.SensorPriors(records=tuple(used)).is_reliable
+    return used[0].scale if used and reliable else None
+
+
 def _session(
     part: reopening.StoredRecording,
     stated: dict[int, given.StatedPose],
+    odometry_scale: float | None,
     folder: Path,
     threads: int | None,
     progress: Progress,
@@ -144,6 +155,7 @@ def _session(
         )
     config = with_given_poses(reopening.stored_config(part, folder))
     config = adaptation.adapted(config, recording, threads, progress)
+    recording, config = adaptation.with_known_odometry(recording, config, odometry_scale)
     opening = reopening.locate_recording(part.opening, folder)
     return Session(part.name, folder, opening, recording, config, stated)
 

@@ -283,6 +283,9 @@ class OdometryEdges(Bounded, ExternalSensor):
         Largest factor on its errors; odometry that needs more is not used.
     gate
         Squared error of a step, in units of the errors of both, beyond which it is rejected.
+    scale
+        Factor on its errors; None: estimated. If known, it is no question whether odometry that
+        agrees with the path is evidence, as where a path rests on it.
     """
 
     drift_m: Annotated[float, Bounds(1e-6, 10)] = 0.005
@@ -291,6 +294,7 @@ class OdometryEdges(Bounded, ExternalSensor):
     relative_rad: Annotated[float, Bounds(0, 10)] = 0.003
     limit: Annotated[float, Bounds(1)] = 5.0
     gate: Annotated[float, Bounds(0, exclusive=True)] = 40.0
+    scale: Annotated[float | None, Bounds(0, exclusive=True)] = None
 
     def measure(self, sensed: SensorData, graph: PoseGraph) -> SensorPriors:
         """See `ExternalSensor.measure`."""
@@ -307,9 +311,11 @@ class OdometryEdges(Bounded, ExternalSensor):
         used = np.ones(len(first), bool)
         # Then without the rejected steps: a jump is in all longer motions over it.
         for _ in range(2):
-            compared = _compare(sensed, graph, variances[used], first[used])
+            compared = None
+            if self.scale is None:
+                compared = _compare(sensed, graph, variances[used], first[used])
             found = (
-                np.ones((2, 2))
+                np.full((2, 2), self.scale or 1.0)
                 if compared is None
                 else compared.scales((1.0, 1.0), (_BETTER, self.limit))
             )
@@ -356,7 +362,7 @@ class OdometryEdges(Bounded, ExternalSensor):
             )
         metric = compared is not None and compared.lengths_agree(scales)
         record = SensorRecord("odometry", len(first), len(kept), scale, text, metric)
-        verified = compared is not None and compared.verified
+        verified = self.scale is not None or (compared is not None and compared.verified)
         return SensorPriors(steps, records=(record,), verified=verified)
 
     def _variances(self, steps: Float64, seconds: Float64) -> Float64:

@@ -266,11 +266,10 @@ def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Reco
         raise InputError(f"is {prior!r}", where="--prior", remedy="use auto, none or device")
     if prior == "none":
         return recording, replace(config, priors=())
-    if _uses(config, external_sensors.OdometryEdges):
-        return recording, config
+    uses_odometry = _uses(config, external_sensors.OdometryEdges)
     uses_gravity = _uses(config, external_sensors.GravityEdges)
     poses = recording.reference if POSES_BY in recording.metadata else None
-    if prior == "auto" and (not uses_gravity or poses is None):
+    if prior == "auto" and (not (uses_gravity or uses_odometry) or poses is None):
         return recording, config
     if recording.odometry is None:
         if poses is None:
@@ -280,10 +279,32 @@ def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Reco
                 remedy="put an odometry.txt next to the images, or use --prior auto",
             )
         recording = with_odometry(recording, poses)
+    if uses_odometry:
+        return recording, config
     gravity = () if uses_gravity else (external_sensors.GravityEdges(),)
     return recording, replace(
         config, priors=(*config.priors, *gravity, external_sensors.OdometryEdges())
     )
+
+
+def with_known_odometry(
+    recording: Recording, config: Config, scale: float | None
+) -> tuple[Recording, Config]:
+    """Return both with odometry whose errors have a known factor; or without it, if that is None.
+
+    Of a recording whose path rests on its odometry already, see `OdometryEdges.scale`.
+    """
+    if scale is None:
+        sensors = (p for p in config.priors if not isinstance(p, external_sensors.OdometryEdges))
+        if recording.odometry is not None:
+            recording = with_odometry(recording, np.full((len(recording), 4, 4), np.nan))
+        return recording, replace(config, priors=tuple(sensors))
+    recording, config = with_prior(recording, config, "auto")
+    sensors = (
+        replace(p, scale=scale) if isinstance(p, external_sensors.OdometryEdges) else p
+        for p in config.priors
+    )
+    return recording, replace(config, priors=tuple(sensors))
 
 
 def with_odometry_prior(config: Config) -> Config:
