@@ -212,6 +212,17 @@ def test_a_solid_that_is_inside_out_is_turned(part) -> None:
     assert worst["deviation_m"] > 0.004
 
 
+def test_a_room_faces_inwards(part) -> None:
+    """It is closed as a solid is, whose faces would be inside out."""
+    room = Reference.of(replace(part.surface, faces=part.surface.faces[:, ::-1]))
+    outside = scan(part, bump=0.006)
+    inside = replace(outside, normals=-outside.normals)
+    found = compared(inside, room, 0.002, searched=False)
+    worst = max(found.worst, key=lambda row: abs(row["deviation_m"]))
+    assert worst["deviation_m"] < -0.004
+    assert found.to_dict()["without_counterpart"] < 0.05
+
+
 def test_a_pose_is_found_without_a_guess(part) -> None:
     found = compared(moved(scan(part)), part, 0.002)
     assert found.verdict == "pass"
