@@ -93,6 +93,10 @@ def test_bad_input_is_named(room_result) -> None:
         planning.expect(result, ["sr5000"])
     with pytest.raises(InputError, match="the path: has fewer than two poses"):
         planning.expect(result, ["sr4000"], poses=np.eye(4)[None])
+    far = result.trajectory.copy()
+    far[:, :3, 3] = 1000 * (far[:, :3, 3] + 0.1)  # in mm
+    with pytest.raises(InputError, match=r"the path: leads .* away from the scan"):
+        planning.expect(result, ["sr4000"], poses=far)
     with pytest.raises(InputError, match="has no surface"):
         planning.expect(replace(result, mesh=None))
 

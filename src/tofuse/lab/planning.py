@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import Mesh as ScannedMesh
@@ -109,8 +110,18 @@ def expect(
     known = np.isfinite(poses).all((1, 2))
     if known.sum() < 2:
         raise InputError("has fewer than two poses", where="the path", remedy="use a longer one")
-    scene = scene_of(scan.mesh)
     path = poses[known]
+    low, high = scan.mesh.vertices.min(0), scan.mesh.vertices.max(0)
+    diagonal = float(np.linalg.norm(high - low))
+    away = np.linalg.norm(path[:, :3, 3] - path[:, :3, 3].clip(low, high), axis=1).max()
+    if away > diagonal:
+        raise InputError(
+            f"leads {quantities.length(float(away))} away from the scan, whose diagonal is "
+            f"{quantities.length(diagonal)}",
+            where="the path",
+            remedy="write it in metres, in the world of the scan",
+        )
+    scene = scene_of(scan.mesh)
     depth_m = _typical_depth(scan.mesh, path)
     expected = []
     for model in models:
