@@ -332,6 +332,11 @@ def test_surfaces_that_don_t_overlap_are_refused(part) -> None:
     far = moved(scan(part), se3.translation(np.array([0, 0, 5.0])))
     with pytest.raises(InputError, match="no surface within"):
         compared(far, part, 0.002, searched=False)
+    with pytest.raises(InputError, match=r"within .* \(a.stl is taken to be in mm\)"):
+        compared(far, part, 0.002, said="a.stl is taken to be in mm", searched=False)
+    result = Reference.of(replace(part.surface, is_result=True))
+    with pytest.raises(InputError, match="state the result first"):
+        compared(far, result, 0.002, searched=False)
 
 
 def test_places_without_bound_have_no_slope() -> None:

@@ -338,10 +338,11 @@ def compared(
     shared_m = float(np.sqrt(sum((s or 0.0) ** 2 for s in shared)))
     deviations = mapped(measured, reference, T, reach, tolerance_m, shared_m, free)
     if not len(deviations.places.deviation):
+        why = "; ".join(filter(None, (said, reason)))
         swapped = reference.surface.is_result and not measured.is_result
         raise InputError(
             f"has no surface within {quantities.length(reach.along)} of {reference.surface.name}"
-            + (f" ({reason})" if reason else ""),
+            + (f" ({why})" if why else ""),
             where=measured.name,
             remedy="state the result first, then what it should be"
             if swapped
