@@ -101,6 +101,19 @@ def test_bad_input_is_named(room_result) -> None:
         planning.expect(replace(result, mesh=None))
 
 
+def test_a_scan_of_an_object_is_planned_from_where_its_camera_was(room_result, monkeypatch) -> None:
+    result = tofuse.load(room_result)
+    outside = result.trajectory.copy()
+    outside[:, :3, 3] += [0, 0, 50]
+
+    def reached(_mesh) -> None:
+        raise NotImplementedError
+
+    monkeypatch.setattr(planning, "scene_of", reached)
+    with pytest.raises(NotImplementedError):
+        planning.expect(replace(result, trajectory=outside), ["sr4000"])
+
+
 @pytest.mark.nightly
 def test_plan_of_the_room(room_result, capsys) -> None:
     status = main(

@@ -111,12 +111,11 @@ def expect(
     if known.sum() < 2:
         raise InputError("has fewer than two poses", where="the path", remedy="use a longer one")
     path = poses[known]
-    low, high = scan.mesh.vertices.min(0), scan.mesh.vertices.max(0)
-    diagonal = float(np.linalg.norm(high - low))
-    away = np.linalg.norm(path[:, :3, 3] - path[:, :3, 3].clip(low, high), axis=1).max()
-    if away > diagonal:
+    diagonal = float(np.linalg.norm(np.ptp(scan.mesh.vertices, axis=0)))
+    away = _distance_from(scan.mesh, path)
+    if away > diagonal + _distance_from(scan.mesh, scan.trajectory[scan.has_pose]):
         raise InputError(
-            f"leads {quantities.length(float(away))} away from the scan, whose diagonal is "
+            f"leads {quantities.length(away)} away from the scan, whose diagonal is "
             f"{quantities.length(diagonal)}",
             where="the path",
             remedy="write it in metres, in the world of the scan",
@@ -192,6 +191,13 @@ def _planned(
     binned = replace(model.binned(_COLUMNS), frame_rate_hz=rate_hz)
     motion_of_camera = Motion(count, 1, rate_hz, path)
     return RecordingPlan(scene, motion_of_camera, binned, _DEFAULT, 0, np.arange(count))
+
+
+def _distance_from(mesh: ScannedMesh, poses: Float64) -> float:
+    """Largest distance of poses (N, 4, 4) from the box around the surface, m."""
+    t = poses[:, :3, 3]
+    nearest = t.clip(mesh.vertices.min(0), mesh.vertices.max(0))
+    return float(np.linalg.norm(t - nearest, axis=1).max())
 
 
 def _typical_depth(mesh: ScannedMesh, poses: Float64) -> float:
