@@ -142,3 +142,13 @@ def test_difference_from_a_reference_is_named(recording, words):
         words = f"the {larger} is {factor}"
     assert words.removeprefix("are ") in note
     assert difference(estimate, reference) is None
+
+
+def test_a_slide_is_not_another_scale():
+    """The estimate hardly follows a way along a corridor, but its noise is much smaller than it."""
+    t = np.linspace(0, 1.6, 20)
+    reference = se3.exp(np.outer(t, [0, 0, 1.0, 0, 0, 0]))
+    lag = np.where(t < 0.8, 0.1 * t, 0.08 + 0.3 * (t - 0.8))
+    estimate = se3.exp(np.outer(lag, [0, 0, 1.0, 0, 0, 0]))
+    assert difference(estimate, reference) is None
+    assert "is 8 times" in difference(reference, with_scale(reference, 8))

@@ -23,6 +23,9 @@ _MIN_LEAD, _MIN_LEAD_SIGMAS, _MAX_REMAINING, _EQUAL = np.radians(1.5), 4.0, 0.35
 # directions; largest factor that is not reported: devices err by less; and within which of a unit's
 # that unit is named.
 _MIN_DISTANCE, _MIN_COSINE, _MAX_FACTOR, _MIN_FIT = 0.015, 0.9, 1.3, 1.2
+# Of another scale are trajectories of the same shape up to this fraction of the extent, as slides
+# along a corridor are shorter, too; from this factor on it is a unit in any case.
+_MAX_SHAPE_ERROR, _MIN_UNIT = 0.1, 30.0
 _UNITS = {"mm": 1000.0, "cm": 100.0, "inches": 39.37, "feet": 3.281}
 # If depth were wrong by these factors, its median would show it.
 _IMPLAUSIBLE_FOR_DEPTH = ("mm", "cm")
@@ -114,9 +117,10 @@ def difference(estimate: Float64, reference: Float64) -> str | None:
         return None
     scale = product / squared
     remaining = np.linalg.norm(t_reference - scale * t), np.linalg.norm(t_reference - t)
-    if remaining[0] > _MAX_REMAINING * remaining[1]:
-        return None
     factor, larger = max((1 / scale, "estimate"), (scale, "reference"))
+    has_shape = remaining[0] <= _MAX_SHAPE_ERROR * np.linalg.norm(t_reference)
+    if remaining[0] > _MAX_REMAINING * remaining[1] or not (has_shape or factor > _MIN_UNIT):
+        return None
     unit = next((u for u, f in _UNITS.items() if 1 / _MIN_FIT < factor / f < _MIN_FIT), None)
     return (
         f"the {larger} is {factor:.3g} times as large as the other trajectory"
