@@ -60,6 +60,7 @@ def test_table_sets_options_per_job(recordings: Path) -> None:
         ("list.txt", "# nothing\n", "lists no recording"),
         ("list.txt", "a/nothing*\n", "line 1: nothing matches a/nothing*"),
         ("list.txt", "a\0b\n", "line 1: contains a NUL"),
+        ("notes.txt", "Recorded on Monday.\n", "but none exists, such as 'Recorded on Monday.'"),
         ("list.csv", "", "lists no recording"),
         ("list.csv", "path\na\n", "row 1: names no recording"),
         ("list.csv", "recording,recording\na,b\n", "name each column once"),

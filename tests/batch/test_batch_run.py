@@ -290,7 +290,7 @@ def test_dask_outcomes_are_translated() -> None:
     ],
 )
 def test_invalid_arguments_are_reported(words, text, tmp_path: Path, capsys) -> None:
-    (tmp_path / "list.txt").write_text("/a\n")
+    (tmp_path / "list.txt").write_text(f"{tmp_path}\n")
     line = ["batch", str(tmp_path / "list.txt"), "--out", str(tmp_path / "out"), *words]
     try:
         status = main(line)

@@ -15,7 +15,7 @@ from posed_results import made_result
 from tofuse.apps.card.drift import drift_of, holm
 from tofuse.apps.card.making import SIGNIFICANCE, make_card
 from tofuse.apps.cli.program import main
-from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
 from tofuse.engine.errors import InputError
 from written_run_json import change_run
 
@@ -38,11 +38,12 @@ def session(
     seed: int = 0,
     about: dict[str, Any] | None = None,
     corrections: list[dict[str, Any]] | None = None,
+    camera: Pinhole = CAMERA,
 ) -> Path:
     """A result of a day that states errors of the camera, 0 but for the focal length."""
     folder.mkdir(parents=True)
     config = {"corrections": corrections or []}
-    result = made_result(folder, CAMERA, config=config)
+    result = made_result(folder, camera, config=config)
     path = folder / "scan" / "camera.json"
     stated = {"sensor": "ifm O3R (ToF)", "serial": "17"} if about is None else about
     path.write_text(json.dumps(json.loads(path.read_text()) | stated))
@@ -158,6 +159,27 @@ def test_results_without_estimates(tmp_path: Path) -> None:
     change_run(results[0], refinement=None)
     with pytest.raises(InputError, match="states no estimates of its camera"):
         make_card(results)
+
+
+def test_results_with_a_severe_fault_are_left_out(tmp_path: Path) -> None:
+    results = campaign(tmp_path, count=3)
+    severe = {"code": "phase_wrap", "severity": "severe", "text": "", "remedy": "", "evidence": {}}
+    change_run(results[1], findings=[severe])
+    card = make_card(results)
+    assert card.drifts["focal"].results == 2
+    assert f"{results[1]} is left out: its recording has a severe fault (phase_wrap)" in (
+        card.warnings
+    )
+    for result in results:
+        change_run(result, findings=[severe])
+    with pytest.raises(InputError, match="severe fault"):
+        make_card(results)
+
+
+def test_a_lens_with_distortion_has_the_focal_length_of_its_file(tmp_path: Path) -> None:
+    lens = BrownConrady(48, 36, 40.0, 41.0, 23.0, 18.0, k1=-0.3)
+    card = make_card([session(tmp_path / f"{k}", 20_000 + k, camera=lens) for k in range(2)])
+    assert card.drifts["focal"].mean == pytest.approx(40, abs=0.2)
 
 
 def test_trend_is_a_weighted_regression() -> None:

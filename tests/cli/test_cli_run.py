@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import tofuse
 from tofuse.apps.cli.program import main
 from tofuse.engine.errors import InputWarning, TofuseError
 from tofuse.engine.results.verdicts import REASONS
@@ -396,6 +397,21 @@ def test_run_is_evaluated(room_result, room_recording, capsys) -> None:
     table = capsys.readouterr().out
     for part in ("ATE rms", "RPE over 1 frame", "RPE over 30 frames", "map consistency"):
         assert part in table
+
+
+def test_evaluate_says_what_is_not_comparable(room_result, room_recording, tmp_path, capsys):
+    rows = np.loadtxt(room_result / "trajectory.txt")
+    poses = tofuse.load(room_result).trajectory
+    np.save(tmp_path / "inverse.npy", np.linalg.inv(poses))
+    np.savetxt(tmp_path / "ms.txt", rows * ([1000] + [1] * 7))
+    assert main(["evaluate", str(tmp_path / "inverse.npy"), str(room_recording)]) == 0
+    assert "if the estimate or the reference holds T_camera_world" in capsys.readouterr().err
+    words = ["evaluate", str(tmp_path / "ms.txt"), str(room_recording)]
+    assert main([*words, "--reference-error", "5mm"]) == 0
+    printed = capsys.readouterr()
+    assert "same clock" in printed.err
+    assert "too few poses" in printed.out
+    assert "true ATE" not in printed.out
 
 
 def test_evaluate_uses_reference_of_recording(room_result, room_recording, tmp_path, capsys):

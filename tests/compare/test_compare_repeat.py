@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from measured_parts import NOISE, drawn, scan
+from tofuse.apps.compare import comparing
 from tofuse.apps.compare.nearest import Reference
 from tofuse.apps.compare.repeating import (
     Session,
@@ -72,6 +73,22 @@ def test_differences_between_sessions_are_separated() -> None:
     assert honest.share > 0.95
     assert honest.low < honest.share <= honest.high
     assert found.to_dict()["components"][0]["unit"] == "m"
+
+
+def test_another_place_is_refused(monkeypatch) -> None:
+    """Also without a bound on its poses, which alone is no reason."""
+    one, other = (
+        replace(s, surface=replace(s.surface, shared_m=np.inf)) for s in sessions(1, 0)[:2]
+    )
+    for believed in (True, False):
+        found = SimpleNamespace(T_target_source=np.eye(4), believed=believed)
+        reason = "" if believed else "the registration is not accepted"
+        monkeypatch.setattr(comparing, "_registered", lambda *_, f=found, r=reason: (f, "", r))
+        if believed:
+            assert repeated([one, other]).common > 0.5
+        else:
+            with pytest.raises(InputError, match="not accepted"):
+                repeated([one, other])
 
 
 def test_a_camera_that_turned_elsewhere_did_not_repeat_its_path() -> None:

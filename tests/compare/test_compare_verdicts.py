@@ -212,6 +212,17 @@ def test_a_solid_that_is_inside_out_is_turned(part) -> None:
     assert worst["deviation_m"] > 0.004
 
 
+def test_a_room_faces_inwards(part) -> None:
+    """It is closed as a solid is, whose faces would be inside out."""
+    room = Reference.of(replace(part.surface, faces=part.surface.faces[:, ::-1]))
+    outside = scan(part, bump=0.006)
+    inside = replace(outside, normals=-outside.normals)
+    found = compared(inside, room, 0.002, searched=False)
+    worst = max(found.worst, key=lambda row: abs(row["deviation_m"]))
+    assert worst["deviation_m"] < -0.004
+    assert found.to_dict()["without_counterpart"] < 0.05
+
+
 def test_a_pose_is_found_without_a_guess(part) -> None:
     found = compared(moved(scan(part)), part, 0.002)
     assert found.verdict == "pass"
@@ -321,6 +332,11 @@ def test_surfaces_that_don_t_overlap_are_refused(part) -> None:
     far = moved(scan(part), se3.translation(np.array([0, 0, 5.0])))
     with pytest.raises(InputError, match="no surface within"):
         compared(far, part, 0.002, searched=False)
+    with pytest.raises(InputError, match=r"within .* \(a.stl is taken to be in mm\)"):
+        compared(far, part, 0.002, said="a.stl is taken to be in mm", searched=False)
+    result = Reference.of(replace(part.surface, is_result=True))
+    with pytest.raises(InputError, match="state the result first"):
+        compared(far, result, 0.002, searched=False)
 
 
 def test_places_without_bound_have_no_slope() -> None:

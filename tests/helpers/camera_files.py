@@ -77,6 +77,7 @@ OTHERS: dict[str, tuple[Callable[[Path], object], str | None, str]] = {
     "sun3d": (made_datasets.make_sun3d, None, "sun3d"),
     "replica": (made_datasets.make_replica, None, "replica"),
     "pairs": (made_datasets.make_pairs, None, "pairs"),
+    "bop": (made_datasets.make_bop, None, "bop"),
     "pcd": (damaged_files.make_pcd, None, "pcd"),
     "ply": (damaged_files.make_ply, None, "ply"),
     "xyz": (damaged_files.make_xyz, None, "xyz"),

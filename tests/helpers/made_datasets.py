@@ -52,6 +52,22 @@ def make_sun3d(folder: Path) -> None:
     np.savetxt(folder / "extrinsics" / "20140808220511.txt", poses.reshape(-1, 4))
 
 
+def make_bop(folder: Path) -> None:
+    """Images 0, 3 and 6 of a scene, in tenths of a millimetre."""
+    cameras = {}
+    for k, (z, T) in enumerate(zip(depths(), np.linalg.inv(POSES), strict=True)):
+        name = f"{3 * k:06d}.png"
+        counts = np.rint(10_000 * z).astype(np.uint16)
+        write_images(folder / "depth" / name, folder / "rgb" / name, counts, k)
+        cameras[str(3 * k)] = {
+            "cam_K": [CAMERA.fx, 0.0, CAMERA.cx, 0.0, CAMERA.fy, CAMERA.cy, 0.0, 0.0, 1.0],
+            "depth_scale": 0.1,
+            "cam_R_w2c": T[:3, :3].ravel().tolist(),
+            "cam_t_w2c": (1000 * T[:3, 3]).tolist(),
+        }
+    (folder / "scene_camera.json").write_text(json.dumps(cameras))
+
+
 def make_replica(folder: Path, parameters: str = "cam_params.json") -> None:
     """With the file of the camera beside the images, or above."""
     for k, z in enumerate(depths()):

@@ -379,6 +379,15 @@ def test_camera_motion_is_classified() -> None:
     assert "static" not in {f.code for f in found.findings}
 
 
+def test_gravity_that_points_up_is_reported() -> None:
+    turn = turning(6, 3.0)
+    down = np.tile([0.0, 1, 0, 0.01], (6, 1))
+    down[2] = np.nan
+    aside, up = down[:, [1, 0, 2, 3]], down * [1, -1, 1, 1]
+    assert codes(turn, gravity=down) == codes(turn, gravity=aside) == set()
+    assert codes(turn, gravity=up) == {"upside_down"}
+
+
 def test_bare_wall_is_detected_and_curved_scene_gives_no_lens_findings() -> None:
     rng = np.random.default_rng(3)
     wall = [image(2.0, k) for k in range(4)]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import tofuse
-from tofuse.apps.inspection.pose_convention import misread_poses
+from tofuse.apps.inspection.pose_convention import difference, misread_poses
 from tofuse.apps.inspection.sample import Sample
 from tofuse.apps.jobs.pose_scale import with_scale
 from tofuse.engine.cameras.cameras import Pinhole
@@ -128,3 +128,27 @@ def test_inspection_reports_poses_of_recording(recording, quick):
     source = ArraySource(frames, recording.reference @ GL)
     found = tofuse.inspect(Recording.of(source, "somewhere", "frames"), quick=quick)
     assert [f.code for f in found.findings if f.severity == "warning"] == ["poses_misread"]
+
+
+@pytest.mark.parametrize("words", MISREAD)
+def test_difference_from_a_reference_is_named(recording, words):
+    noise = 0.0002 * np.random.default_rng(1).standard_normal((len(recording), 6))
+    reference = recording.reference @ se3.exp(noise)
+    estimate = se3.exp(np.array([1.0, 2, 3, 0.4, -0.5, 0.6])) @ recording.reference
+    note = difference(MISREAD[words](estimate), reference)
+    factor, _, of_images = words.partition(" times as ")
+    if of_images:
+        larger, factor = ("reference", "2.5") if factor == "0.4" else ("estimate", factor)
+        words = f"the {larger} is {factor}"
+    assert words.removeprefix("are ") in note
+    assert difference(estimate, reference) is None
+
+
+def test_a_slide_is_not_another_scale():
+    """The estimate hardly follows a way along a corridor, but its noise is much smaller than it."""
+    t = np.linspace(0, 1.6, 20)
+    reference = se3.exp(np.outer(t, [0, 0, 1.0, 0, 0, 0]))
+    lag = np.where(t < 0.8, 0.1 * t, 0.08 + 0.3 * (t - 0.8))
+    estimate = se3.exp(np.outer(lag, [0, 0, 1.0, 0, 0, 0]))
+    assert difference(estimate, reference) is None
+    assert "is 8 times" in difference(reference, with_scale(reference, 8))

@@ -178,7 +178,8 @@ class Notes(Silent):
 
 def test_convention_of_inverted_poses_is_named(recording, truth):
     notes = Notes()
-    tofuse.judge(recording, se3.inverse(truth), progress=notes)
+    judged = tofuse.judge(recording, se3.inverse(truth), progress=notes)
+    assert judged.cause is None
     (named,) = [text for text in notes.texts if "The poses fit the images if" in text]
     assert "T_camera_world, the inverse" in named
     quiet = Notes()

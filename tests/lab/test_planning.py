@@ -93,8 +93,25 @@ def test_bad_input_is_named(room_result) -> None:
         planning.expect(result, ["sr5000"])
     with pytest.raises(InputError, match="the path: has fewer than two poses"):
         planning.expect(result, ["sr4000"], poses=np.eye(4)[None])
+    far = result.trajectory.copy()
+    far[:, :3, 3] = 1000 * (far[:, :3, 3] + 0.1)  # in mm
+    with pytest.raises(InputError, match=r"the path: leads .* away from the scan"):
+        planning.expect(result, ["sr4000"], poses=far)
     with pytest.raises(InputError, match="has no surface"):
         planning.expect(replace(result, mesh=None))
+
+
+def test_a_scan_of_an_object_is_planned_from_where_its_camera_was(room_result, monkeypatch) -> None:
+    result = tofuse.load(room_result)
+    outside = result.trajectory.copy()
+    outside[:, :3, 3] += [0, 0, 50]
+
+    def reached(_mesh) -> None:
+        raise NotImplementedError
+
+    monkeypatch.setattr(planning, "scene_of", reached)
+    with pytest.raises(NotImplementedError):
+        planning.expect(replace(result, trajectory=outside), ["sr4000"])
 
 
 @pytest.mark.nightly

@@ -34,6 +34,15 @@ def euroc(path: Path) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
+def orb_slam3(path: Path) -> None:
+    """What ORB-SLAM3 calls EuRoC: times in ns, the quaternion in the order of TUM."""
+    rows = [
+        f"{1e9 * time:.6f} " + " ".join(str(float(v)) for v in (*T[:3, 3], *from_matrix(T[:3, :3])))
+        for time, T in zip(TIMES, POSES, strict=True)
+    ]
+    path.write_text("\n".join(rows) + "\n")
+
+
 def colmap(path: Path) -> None:
     lines = ["# Image list with two lines of data per image:"]
     for k in (3, 0, 1, 4, 2):
@@ -55,13 +64,14 @@ def transforms(path: Path) -> None:
 FORMATS = {
     "a.txt": lambda path: write_tum(path, TIMES, POSES),
     "data.csv": euroc,
+    "orb.txt": orb_slam3,
     "kitti.txt": lambda path: write_kitti(path, POSES),
     "trajectory.log": lambda path: write_log(path, POSES, np.arange(5)),
     "images.txt": colmap,
     "transforms.json": transforms,
     "poses.npy": lambda path: np.save(path, POSES),
 }
-TIMED = ("a.txt", "data.csv")
+TIMED = ("a.txt", "data.csv", "orb.txt")
 
 
 @pytest.mark.parametrize("name", FORMATS)

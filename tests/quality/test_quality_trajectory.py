@@ -132,6 +132,16 @@ def test_short_trajectory_has_no_relative_error() -> None:
     json.dumps(plain, allow_nan=False)
 
 
+def test_a_single_pose_has_no_errors() -> None:
+    """Alignment fits it, whatever it is."""
+    T = walk(10)
+    result = evaluate_trajectory([3], T[7:8], np.arange(10), T)
+    assert result.associated == 1
+    assert math.isnan(result.ate_rms_m)
+    assert result.to_dict()["rotation_rms_deg"] is None
+    json.dumps(result.to_dict(), allow_nan=False)
+
+
 def test_lost_frames_reduce_coverage_only() -> None:
     T = walk(100)
     times = np.arange(100) / 10
@@ -173,7 +183,7 @@ def test_errors_are_invariant_to_world_frames(seed: int) -> None:
 
 def test_unmatched_trajectories_are_rejected() -> None:
     T = walk(3)
-    with pytest.raises(InputError, match=r"no pose is within 0.02 s"):
+    with pytest.raises(InputError, match=r"no pose is within 0.02 s.*0 to 2 s.*100 to 102 s"):
         evaluate_trajectory([0, 1, 2], T, [100, 101, 102], T)
     with pytest.raises(InputError, match="shape"):
         evaluate_trajectory([0, 1, 2], T[:, :3], [0, 1, 2], T)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import made_datasets as made
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.recording import Recording
 from tofuse.formats.images.images import read_image, write_png
 from tofuse.formats.recordings.open import open_recording
@@ -38,6 +38,34 @@ def test_sun3d(tmp_path: Path) -> None:
     check(recording, "sun3d")
     np.testing.assert_allclose(recording.timestamps, [0, 0.066, 0.132])
     assert recording.warnings == []
+
+
+def test_bop(tmp_path: Path) -> None:
+    made.make_bop(tmp_path / "000001")
+    recording = open_recording(tmp_path / "000001")
+    check(recording, "bop")
+    assert not recording.has_timestamps
+    np.testing.assert_allclose(recording.reference, made.POSES, atol=1e-6)
+
+
+def test_bop_without_poses_and_with_another_unit(tmp_path: Path) -> None:
+    """Poses are optional, and units differ from image to image."""
+    made.make_bop(tmp_path)
+    file = tmp_path / "scene_camera.json"
+    cameras = json.loads(file.read_text())
+    depth = open_recording(tmp_path)[1].depth
+    for entry in cameras.values():
+        del entry["cam_R_w2c"]
+    cameras["3"]["depth_scale"] = 1.0
+    cameras["6"]["depth_scale"] = 0
+    del cameras["0"]
+    file.write_text(json.dumps(cameras))
+    recording = open_recording(tmp_path)
+    assert recording.reference is None
+    np.testing.assert_allclose(recording[1].depth, 10 * depth, rtol=1e-6)
+    for k, problem in ((0, "image 0: is missing"), (2, "image 6: depth_scale: is 0")):
+        with pytest.raises(UnreadableFrameError, match=problem):
+            recording[k]
 
 
 def test_sun3d_far_depth(tmp_path: Path) -> None:

@@ -343,6 +343,14 @@ def test_redwood_with_other_images_missing_of_each_kind(tmp_path: Path, names: s
     assert colors == [0, 40, 80, 160]
 
 
+def test_redwood_with_tiff_depth_names_what_reads_it(tmp_path: Path) -> None:
+    make_redwood(tmp_path)
+    for file in (tmp_path / "depth").glob("*.png"):
+        file.rename(file.with_suffix(".tiff"))
+    with pytest.raises(InputError, match=r"has no .png files, but \d+ .tif files.*--format tiff"):
+        open_recording(tmp_path)
+
+
 def test_redwood_without_camera_is_ambiguous(tmp_path: Path) -> None:
     make_redwood(tmp_path)
     (tmp_path / "trajectory.log").unlink()

@@ -46,6 +46,8 @@ def test_cause_precedes_its_consequences(cause, advice) -> None:
 
 
 def test_unbounded_and_unassessed_accuracy() -> None:
+    turned = Accuracy(position_m=0.04, rotation_rad=1.08, relative=0.008, assessed=True)
+    assert bound(turned, 5.0) == "±40 mm and 62° (95 %) over 5 m, 0.8 %"
     assert bound(Accuracy(), 5.0) == "accuracy not assessed"
     assert weakest_frame(Accuracy()) == ""
     loose = Accuracy(np.inf, 0.1, np.inf, True, WorstFrame(4, np.inf, 0.1), (4, 5, 6, 9))

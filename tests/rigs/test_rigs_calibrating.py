@@ -169,6 +169,9 @@ def test_recordings_of_rig_are_opened_again(tmp_path: Path) -> None:
     assert recording.metadata["cameras"] == list(names)
     with pytest.raises(InputError, match=r"has 2 cameras .* 1 recordings are given"):
         replace(opening, paths=opening.paths[:1]).open()
+    write_rig(tmp_path / "rig.json", Rig(tuple(rows), unplaced={"top": "too dark"}))
+    with pytest.raises(InputError, match="and none of top, whose pose was not found"):
+        replace(opening, paths=(*opening.paths, folder / "top")).open()
 
 
 def test_rig_is_not_taken_for_one_camera(tmp_path: Path, capsys) -> None:

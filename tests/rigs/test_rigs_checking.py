@@ -105,6 +105,13 @@ def test_recordings_in_another_order_are_refused(tmp_path: Path) -> None:
         open_cameras(paths, names=["a", "b"])
 
 
+def test_cameras_that_are_not_found_again_are_named() -> None:
+    before = measured(truth(), np.random.default_rng(6))
+    after = Rig(before.cameras[:1], unplaced={"1": "too dark", "2": "too dark"})
+    reasons = [motion.reason for motion in compare(before, after)]
+    assert reasons[:2] == ["the pose of no other camera was found", "too dark"]
+
+
 def test_camera_without_common_surface_is_not_compared() -> None:
     rng = np.random.default_rng(5)
     before, after = measured(truth(), rng), measured(truth(), rng)

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import Mesh as ScannedMesh
@@ -109,8 +110,17 @@ def expect(
     known = np.isfinite(poses).all((1, 2))
     if known.sum() < 2:
         raise InputError("has fewer than two poses", where="the path", remedy="use a longer one")
-    scene = scene_of(scan.mesh)
     path = poses[known]
+    diagonal = float(np.linalg.norm(np.ptp(scan.mesh.vertices, axis=0)))
+    away = _distance_from(scan.mesh, path)
+    if away > diagonal + _distance_from(scan.mesh, scan.trajectory[scan.has_pose]):
+        raise InputError(
+            f"leads {quantities.length(away)} away from the scan, whose diagonal is "
+            f"{quantities.length(diagonal)}",
+            where="the path",
+            remedy="write it in metres, in the world of the scan",
+        )
+    scene = scene_of(scan.mesh)
     depth_m = _typical_depth(scan.mesh, path)
     expected = []
     for model in models:
@@ -181,6 +191,13 @@ def _planned(
     binned = replace(model.binned(_COLUMNS), frame_rate_hz=rate_hz)
     motion_of_camera = Motion(count, 1, rate_hz, path)
     return RecordingPlan(scene, motion_of_camera, binned, _DEFAULT, 0, np.arange(count))
+
+
+def _distance_from(mesh: ScannedMesh, poses: Float64) -> float:
+    """Largest distance of poses (N, 4, 4) from the box around the surface, m."""
+    t = poses[:, :3, 3]
+    nearest = t.clip(mesh.vertices.min(0), mesh.vertices.max(0))
+    return float(np.linalg.norm(t - nearest, axis=1).max())
 
 
 def _typical_depth(mesh: ScannedMesh, poses: Float64) -> float:

@@ -133,11 +133,26 @@ def _is_list(path: Path) -> bool:
 
 
 def _text_rows(text: str, path: Path) -> Iterator[_Row]:
+    rows = []
     for k, line in enumerate(text.splitlines()):
         # Only at the beginning of a line or after a blank: names may contain a #.
         pattern = re.sub(r"(^|\s)#.*", "", line).strip()
         if pattern:
-            yield _Row(f"{path}: line {k + 1}", pattern)
+            rows.append(_Row(f"{path}: line {k + 1}", pattern))
+    if rows and not any(_may_exist(row.pattern, path.absolute().parent) for row in rows):
+        raise InputError(
+            f"is read as a list of recordings, but none exists, such as {rows[0].pattern!r:.80}",
+            where=path,
+            remedy="correct the paths, which are relative to the folder of the list, or leave "
+            "this file out",
+        )
+    yield from rows
+
+
+def _may_exist(pattern: str, base: Path) -> bool:
+    """Whether a path exists; globs and what can't be a path are judged later."""
+    path = os.path.join(base, os.path.expanduser(pattern))
+    return has_magic(pattern) or "\0" in pattern or os.path.lexists(path)
 
 
 def _csv_rows(text: str, path: Path) -> Iterator[_Row]:

@@ -64,6 +64,8 @@ class Session:
     noise
         The noise law that it assumed: name, and a and b of sigma = a + b r^2; None if it is that of
         the camera or of another channel.
+    fault
+        Code of a severe fault of its recording, which spoils what it states: it has no values then.
     """
 
     name: str
@@ -71,6 +73,7 @@ class Session:
     by_file: bool
     values: dict[str, tuple[float, float]]
     noise: tuple[str, float, float] | None
+    fault: str = ""
 
 
 def collected(results: Sequence[Path]) -> tuple[Identity, list[Session]]:
@@ -102,6 +105,7 @@ def _read(folder: Path) -> tuple[Identity, Session]:
         check = (run.get("refinement") or {}).get("suspicion") or {}
         rms = np.array([frame["rms_m"] for frame in run["frames"] if frame.get("rms_m")])
         estimates = {name: tuple(pair) for name, pair in check.get("estimates", {}).items()}
+        severe = [f["code"] for f in run.get("findings", ()) if f["severity"] == "severe"]
     if len(parts) > 1 or run.get("rig"):
         raise InputError(
             "is of several recordings", where=folder, remedy="pass the result of each recording"
@@ -118,9 +122,12 @@ def _read(folder: Path) -> tuple[Identity, Session]:
         (frame.camera.width, frame.camera.height),
     )
     corrections = {each["part"]: each for each in part.config.get("corrections", [])}
-    values = values_of(estimates, corrections, pinhole_of(frame.camera), rms)
+    lens = frame.camera if isinstance(frame.camera, Pinhole) else pinhole_of(frame.camera)
+    values = {} if severe else values_of(estimates, corrections, lens, rms)
     time, by_file = _time_of(recording, reopening.locate_recording(part.opening, folder).paths[0])
-    return identity, Session(str(folder), time, by_file, values, _noise(corrections))
+    return identity, Session(
+        str(folder), time, by_file, values, _noise(corrections), "".join(severe[:1])
+    )
 
 
 def values_of(

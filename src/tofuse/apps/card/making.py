@@ -129,6 +129,9 @@ def make_card(results: Sequence[Path]) -> Card:
         If they are of different cameras, or state nothing; see `collected`.
     """
     camera, sessions = collected(results)
+    if all(session.fault for session in sessions):
+        fault = f"is of a recording with a severe fault ({sessions[0].fault})"
+        raise InputError(fault, where=sessions[0].name, remedy="pass results without one")
     if not any(session.values for session in sessions):
         raise InputError(
             "states no estimates of its camera: it is of an older version, or has too few "
@@ -185,7 +188,10 @@ def _warnings(card: Card) -> Iterator[str]:
         yield "Some frames have no dates: those of the recordings' files are used"
     if not card.camera.serial:
         yield "The recordings state no serial number: another camera of this name would pass"
-    silent = sum(not session.values for session in card.sessions)
+    for session in card.sessions:
+        if session.fault:
+            yield f"{session.name} is left out: its recording has a severe fault ({session.fault})"
+    silent = sum(not session.values and not session.fault for session in card.sessions)
     if silent:
         yield f"{silent} of {len(card.sessions)} results state no estimates of the camera"
 

@@ -481,7 +481,6 @@ def _stop_on_signal() -> Iterator[threading.Event]:
 def evaluate(arguments: cli.Evaluate) -> int:
     """``tofuse evaluate``."""
     from tofuse.apps.jobs import evaluate as evaluate_poses
-    from tofuse.engine.times import MAX_GAP_S
 
     evaluation = evaluate_poses(
         arguments.estimate,
@@ -490,21 +489,20 @@ def evaluate(arguments: cli.Evaluate) -> int:
         reference_error_m=arguments.reference_error,
     )
     data, error, interval = evaluation.to_dict(), evaluation.error, evaluation.ate_interval_m
-    if error.mostly_unmatched:
-        print(
-            f"note: only {error.associated} of {error.estimated} estimated poses have a reference "
-            f"pose within {1000 * MAX_GAP_S:.0f} ms: "
-            "check that both files have the same clock",
-            file=sys.stderr,
-        )
+    for note in evaluation.notes:
+        print(f"note: {note}", file=sys.stderr)
     table = Table.grid(padding=(0, 2))
     table.add_row(
         "poses compared", f"{error.associated} ({percent(error.coverage)} of the reference)"
     )
-    table.add_row("ATE rms", f"{error.ate_rms_m:.4f} m, {data['rotation_rms_deg']:.3f} deg")
+    rms = maximum = "too few poses"
+    if error.associated > 1:
+        rms = f"{error.ate_rms_m:.4f} m, {data['rotation_rms_deg']:.3f} deg"
+        maximum = f"{error.ate_max_m:.4f} m"
+    table.add_row("ATE rms", rms)
     if interval is not None:
         table.add_row("true ATE within", f"{interval[0]:.4f} to {interval[1]:.4f} m")
-    table.add_row("ATE maximum", f"{error.ate_max_m:.4f} m")
+    table.add_row("ATE maximum", maximum)
     for r in error.relative:
         value = "too few poses"
         if r.pairs:

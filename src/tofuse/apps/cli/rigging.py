@@ -57,6 +57,7 @@ def rig_calibrate(arguments: RigCalibrate) -> int:
 def rig_check(arguments: RigCheck) -> int:
     """``tofuse rig check``."""
     rig = read_rig(arguments.rig)
+    rig.check_count(len(arguments.inputs), arguments.rig)
     calibration = _calibrated(arguments, [camera.name for camera in rig.cameras])
     cameras = compare_in_scene(rig, calibration.rig)
     rows = [

@@ -36,6 +36,9 @@ WORST = 5  # places that are listed of each region
 _MAX_POINTS = 100_000  # that are registered
 # A reference is symmetric if this fraction of it, moved, lies within this fraction of its diagonal.
 _SYMMETRIC_SHARE, _SYMMETRIC_DISTANCE, _SYMMETRIC_POINTS = 0.9, 2e-3, 4000
+# Fraction of the points facing the other way from which a reference is turned. Near thin sheets,
+# whose two sides are within the noise, it is a half.
+_TURNED_SHARE = 0.8
 _NEARER = 0.5  # distance from the guess to a pose, relative to that to a rival which it excludes
 _MAX_RIVAL = 0.9  # fraction of the points of a pose that a rival may explain, to be excluded
 _MAX_FITTED = 0.3  # by which a fit changes a symmetry, as a fraction of it
@@ -329,16 +332,21 @@ def compared(
     if searched:
         registration, given, reason = _registered(measured, reference, guess)
         T = registration.T_target_source
+    reference = _facing_alike(measured, reference, T)
     T, free = fitted(measured, reference, T, reach, tolerance_m)
     shared = [measured.shared_m, reference.surface.shared_m]
     shared_m = float(np.sqrt(sum((s or 0.0) ** 2 for s in shared)))
     deviations = mapped(measured, reference, T, reach, tolerance_m, shared_m, free)
     if not len(deviations.places.deviation):
+        why = "; ".join(filter(None, (said, reason)))
+        swapped = reference.surface.is_result and not measured.is_result
         raise InputError(
             f"has no surface within {quantities.length(reach.along)} of {reference.surface.name}"
-            + (f" ({reason})" if reason else ""),
+            + (f" ({why})" if why else ""),
             where=measured.name,
-            remedy="check the units (--unit), or pass --guess",
+            remedy="state the result first, then what it should be"
+            if swapped
+            else "check the units (--unit), or pass --guess",
         )
     warnings = [said] if said else []
     if measured.shared_m is None:
@@ -432,12 +440,30 @@ def _distance(points: Float64, T: Float64, T_other: Float64) -> float:
 
 def _explained(measured: Surface, reference: Reference, T: Float64) -> float:
     """Return the fraction of points near the reference at a pose, after its fit."""
+    reference = _facing_alike(measured, reference, T)
     reach = Reach.of(reference, spacing_of(measured.points))
     T, _ = fitted(measured, reference, T, reach, None)
     chosen = scene.random_subset(len(measured.points), _SYMMETRIC_POINTS)
     points, normals = se3.transform(T, measured.points[chosen]), measured.normals[chosen]
     found = reference.distances(points, normals @ T[:3, :3].T, reach, oriented=measured.oriented)
     return float((np.abs(found.signed) < _SYMMETRIC_DISTANCE * reference.diagonal).mean())
+
+
+def _facing_alike(measured: Surface, reference: Reference, T: Float64) -> Reference:
+    """Return the reference, turned if nearly all that was measured at a pose faces the other way.
+
+    Rooms are closed and face inwards; not all files have the order of corners that formats demand.
+    """
+    if not (measured.oriented and reference.surface.oriented):
+        return reference
+    chosen = scene.random_subset(len(measured.points), _SYMMETRIC_POINTS)
+    points, normals = se3.transform(T, measured.points[chosen]), measured.normals[chosen]
+    normals = normals @ T[:3, :3].T
+    reach = Reach.of(reference, spacing_of(measured.points))
+    found = reference.distances(points, normals, reach, oriented=False)
+    facing = (found.normals * normals).sum(1)[found.compared]
+    is_turned = len(facing) > 0 and (facing < 0).mean() > _TURNED_SHARE
+    return replace(reference, normals=-reference.normals) if is_turned else reference
 
 
 def _is_symmetry(reference: Reference, motion: Float64, *, exact: bool = False) -> bool:

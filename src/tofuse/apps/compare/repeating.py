@@ -192,7 +192,8 @@ def repeated(sessions: Sequence[Session], *, searched: bool = True) -> Repetitio
         T = np.eye(4)
         if k:
             comparison = compared(session.surface, reference, searched=searched)
-            if comparison.reason and np.isfinite(comparison.shared_m):
+            registration = comparison.registration
+            if registration is not None and not (registration.believed or comparison.given):
                 raise InputError(comparison.reason, where=session.name, remedy="leave it out")
             T = comparison.deviations.T_reference_measured
         shared = session.surface.shared_m or 0.0

@@ -11,6 +11,6 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.apps.inspection.finding import Finding
     from tofuse.apps.inspection.inspect import inspect_recording
-    from tofuse.apps.inspection.pose_convention import convention_of
+    from tofuse.apps.inspection.pose_convention import convention_of, difference
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -25,7 +25,7 @@ CODES: dict[str, Severity] = {
          "few_valid", "flying_pixels", "some_phase_wrap", "poses_misread", "depth_scale",
          "little_overlap", "fast_motion"),
         "warning"),
-    **dict.fromkeys(("static", "wall_only"), "note"),
+    **dict.fromkeys(("static", "wall_only", "upside_down"), "note"),
 }  # fmt: skip
 
 

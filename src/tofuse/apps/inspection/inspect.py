@@ -48,6 +48,7 @@ CHECKS: tuple[Check, ...] = (
     motion_checks.check_motion,
     motion_checks.check_still,
     motion_checks.check_walls,
+    motion_checks.check_gravity,
     pose_convention.check_poses,
 )
 

@@ -1,4 +1,4 @@
-"""Checks of the camera's motion, and of single-plane views."""
+"""Checks of the camera's motion, of single-plane views, and of the direction of gravity."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ _MIN_OVERLAP, _MAX_SHIFT = 0.5, 0.2
 _MIN_FREQUENCY = 0.5
 # Minimum fraction of the pixels on the largest plane in a single-plane view.
 _MIN_WALL_FRACTION = 0.8
+# Gravity within 60 degrees of the top of the image: no camera on its side or facing down has that.
+_MAX_DOWN = -0.5
 # Maximum misfit of a plane, relative to the depth.
 _MAX_MISFIT = 0.02
 
@@ -92,4 +94,21 @@ def check_walls(sample: Sample) -> Iterator[Finding]:
             "the motion of the camera is not observable.",
             "Keep a corner, furniture or texture in view.",
             {"frames": len(single_plane), "single_plane": sum(single_plane)},
+        )
+
+
+def check_gravity(sample: Sample) -> Iterator[Finding]:
+    """Check that gravity points to the bottom of the images, as it does for an upright camera."""
+    gravity = sample.recording.gravity
+    if gravity is None or not np.isfinite(gravity).all(1).any():
+        return
+    down = float(np.nanmedian(gravity[:, 1]))
+    if down < _MAX_DOWN:
+        yield Finding(
+            "upside_down",
+            "Gravity points to the top of the images: the camera was upside down, or the "
+            "accelerations are reversed.",
+            "If it was upright, reverse their sign: ax, ay, az point up at rest, gravity_x, "
+            "gravity_y, gravity_z down, in the camera's axes (y down). Else ignore this.",
+            {"down_cosine": down},
         )

@@ -1,4 +1,4 @@
-"""Check of the poses of a recording: their convention, and their scale relative to the depth."""
+"""Checks of poses: their convention, and their scale relative to the depth or to a reference."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.geometry import quaternion, se3
+from tofuse.engine.quality import trajectory_errors
 from tofuse.formats.poses import OPENGL
 
 # Minimum decrease of the error by another convention, rad and in standard errors; and the largest
@@ -22,6 +23,9 @@ _MIN_LEAD, _MIN_LEAD_SIGMAS, _MAX_REMAINING, _EQUAL = np.radians(1.5), 4.0, 0.35
 # directions; largest factor that is not reported: devices err by less; and within which of a unit's
 # that unit is named.
 _MIN_DISTANCE, _MIN_COSINE, _MAX_FACTOR, _MIN_FIT = 0.015, 0.9, 1.3, 1.2
+# Of another scale are trajectories of the same shape up to this fraction of the extent, as slides
+# along a corridor are shorter, too; from this factor on it is a unit in any case.
+_MAX_SHAPE_ERROR, _MIN_UNIT = 0.1, 30.0
 _UNITS = {"mm": 1000.0, "cm": 100.0, "inches": 39.37, "feet": 3.281}
 # If depth were wrong by these factors, its median would show it.
 _IMPLAUSIBLE_FOR_DEPTH = ("mm", "cm")
@@ -79,6 +83,66 @@ def check_poses(sample: Sample) -> Iterator[Finding]:
 def convention_of(recording: Recording, poses: Float64) -> Finding | None:
     """Return in what other convention poses (N, 4, 4) of a recording fit it, if they do."""
     return next(misread_poses(Sample.of(recording, _VIEWS), poses), None)
+
+
+def difference(estimate: Float64, reference: Float64) -> str | None:
+    """Return what explains most of the difference of associated poses (N, 4, 4), if anything does.
+
+    That is another convention, or another scale, of one of the two trajectories.
+    """
+    if len(estimate) <= _MIN_PAIRS:
+        return None
+    as_read = _errors(estimate, reference)
+    converted = {
+        name: {
+            "the estimate": _errors(convert(estimate), reference),
+            "the reference": _errors(estimate, convert(reference)),
+        }
+        for name, convert in _CONVENTIONS.items()
+    }
+    best = min(float(error.mean()) for sides in converted.values() for error in sides.values())
+    if as_read.mean() > _MIN_LEAD + best and best <= _MAX_REMAINING * as_read.mean():
+        ifs = []
+        for name, sides in converted.items():
+            fit = [side for side, error in sides.items() if error.mean() <= _EQUAL * best]
+            ifs += [f"{' or '.join(fit)} holds {name}"] if fit else []
+        return (
+            f"the poses differ by {np.degrees(as_read.mean()):.1f} degrees as they are read, and "
+            f"by {np.degrees(best):.1f} if {', or '.join(ifs)}"
+        )
+    aligned = trajectory_errors.align(estimate, reference) @ estimate
+    t, t_reference = (T[:, :3, 3] - T[:, :3, 3].mean(0) for T in (aligned, reference))
+    product, squared = float((t * t_reference).sum()), float((t * t).sum())
+    if product <= _MIN_COSINE * np.sqrt(squared * (t_reference * t_reference).sum()):
+        return None
+    scale = product / squared
+    remaining = np.linalg.norm(t_reference - scale * t), np.linalg.norm(t_reference - t)
+    factor, larger = max((1 / scale, "estimate"), (scale, "reference"))
+    has_shape = remaining[0] <= _MAX_SHAPE_ERROR * np.linalg.norm(t_reference)
+    if remaining[0] > _MAX_REMAINING * remaining[1] or not (has_shape or factor > _MIN_UNIT):
+        return None
+    unit = next((u for u, f in _UNITS.items() if 1 / _MIN_FIT < factor / f < _MIN_FIT), None)
+    return (
+        f"the {larger} is {factor:.3g} times as large as the other trajectory"
+        + (f", as if it were in {unit}" if unit else "")
+        + f": in the same scale the ATE would be {remaining[0] / np.sqrt(len(t)):.4f} m"
+    )
+
+
+def _errors(estimate: Float64, reference: Float64) -> Float64:
+    """(N,) differences of associated poses in the best scale, rad.
+
+    Positions count relative to the spread of the reference, or to 1 m if that is less.
+    """
+    spread, arm = (
+        float(np.linalg.norm(T[:, :3, 3] - T[:, :3, 3].mean(0), axis=1).max())
+        for T in (estimate, reference)
+    )
+    scaled = estimate.copy()
+    scaled[:, :3, 3] *= arm / spread if spread > 0 else 1.0
+    arm = max(arm, 1.0)
+    error = se3.inverse(trajectory_errors.align(scaled, reference, arm) @ scaled) @ reference
+    return np.hypot(se3.angle(error), np.linalg.norm(error[:, :3, 3], axis=1) / arm)
 
 
 def _turned_frame(recording: Recording, poses: Float64, k: int) -> RangeFrame | None:

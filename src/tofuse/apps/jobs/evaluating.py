@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from tofuse.apps.inspection import difference
 from tofuse.apps.results import folders, run_json
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
@@ -19,6 +20,7 @@ from tofuse.engine.parts import check_number
 from tofuse.engine.quality import map_agreement, trajectory_errors
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.sensor import CameraErrors, Corrector
+from tofuse.engine.times import MAX_GAP_S
 from tofuse.formats.files import reading
 from tofuse.formats.poses import Clock, TimedPoses, associated_poses, read_poses
 from tofuse.formats.recordings import open_recording, read_reference
@@ -38,11 +40,14 @@ class Evaluation:
         Bounds of the true ATE; None if the error of the reference is unknown.
     consistency
         Map consistency of the recording's images at these poses; None without a recording.
+    notes
+        What suggests that the two trajectories are not comparable as they were read: in sentences.
     """
 
     error: trajectory_errors.TrajectoryError
     ate_interval_m: tuple[float, float] | None = None
     consistency: map_agreement.Consistency | None = None
+    notes: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures as plain data, angles in degrees."""
@@ -51,6 +56,7 @@ class Evaluation:
             data["ate_interval_m"] = list(self.ate_interval_m)
         if self.consistency is not None:
             data["map_consistency"] = self.consistency.to_dict()
+        data["notes"] = list(self.notes)
         return data
 
     def __repr__(self) -> str:
@@ -109,11 +115,13 @@ def evaluate(
     if recording is not None:
         clock = recording.timestamps, recording.indices
     timed = _poses(estimate, names[0]), _poses(reference, names[1], is_reference=True)
-    by_frame = [n for n, poses in zip(names, timed, strict=True) if poses.timestamps is None]
-    if clock is None and len(by_frame) == 1:
+    by_frame = [poses.timestamps is None for poses in timed]
+    if clock is None and sum(by_frame) == 1:
+        clock = _clock_of_recording(reference if by_frame[0] else estimate)
+    if clock is None and sum(by_frame) == 1:
         raise InputError(
             "has poses by frame, the other file by time",
-            where=by_frame[0],
+            where=names[by_frame.index(True)],
             remedy="pass the recording, which has the times (--recording)",
         )
     arrays = [isinstance(source, np.ndarray) for source in (estimate, reference)]
@@ -138,14 +146,25 @@ def evaluate(
         )
     except InputError as cause:
         raise InputError(cause.problem, where=", ".join(names), remedy=cause.remedy) from cause
-    interval = None if reference_error_m is None else error.ate_within(reference_error_m)
+    interval = None
+    if reference_error_m is not None and error.associated > 1:
+        interval = error.ate_within(reference_error_m)
+    notes = []
+    if error.mostly_unmatched:
+        notes.append(
+            f"only {error.associated} of {error.estimated} estimated poses have a reference pose "
+            f"within {1000 * MAX_GAP_S:.0f} ms: check that both files have the same clock "
+            f"({trajectory_errors.spans(times, reference_times)})"
+        )
+    if text := difference(poses[error.pairs[:, 0]], reference_poses[error.pairs[:, 1]]):
+        notes.append(text)
     consistency = None
     if recording is not None:
         frame_poses = associated_poses(recording.timestamps, times, poses)
         consistency = map_agreement.map_consistency(
             recording, frame_poses, correctors=_correctors(estimate, of_estimate, config)
         )
-    return Evaluation(error, interval, consistency)
+    return Evaluation(error, interval, consistency, tuple(notes))
 
 
 @dataclass(frozen=True)
@@ -179,6 +198,17 @@ def _correctors(
         return ()
     with reading.damage_reported(result.folder / "run.json", "a run.json"):
         return CameraErrors.made_with(result.run["config"])
+
+
+def _clock_of_recording(source: Poses) -> Clock | None:
+    """Return the clock of the recording that poses are read from; None if they are of none."""
+    if not isinstance(source, str | Path):
+        return None
+    try:
+        recording = open_recording(source)
+    except InputError:
+        return None
+    return recording.timestamps, recording.indices
 
 
 def _poses(source: Poses, name: str, *, is_reference: bool = False) -> TimedPoses:

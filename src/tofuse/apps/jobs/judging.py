@@ -225,7 +225,7 @@ def judge(
         )
         deviation = _deviation(poses, refined.poses, used, images.row_of)
         cause = None
-        if deviation is not None:
+        if deviation is not None and not refined.misread:  # which looks like drift
             velocity = _velocities(recording, poses)[[images.row_of[v.index] for v in used]]
             cause = pose_causes.cause_of(deviation, velocity)
         consistency, refined_consistency = _consistencies(
@@ -350,6 +350,8 @@ class _Refined:
         The images at these poses.
     started
         Whether they were refined from the given ones.
+    misread
+        Whether the given ones fit in another convention.
     """
 
     poses: Float64
@@ -357,6 +359,7 @@ class _Refined:
     views: Views
     compared: cross_view_agreement.CrossViewConsistency
     started: bool
+    misread: bool = False
 
 
 def _refined(
@@ -391,6 +394,7 @@ def _refined(
         return refined
     if finding := convention_of(recording, poses):
         progress.note(str(finding))
+        refined = replace(refined, misread=finding.code == "poses_misread")
     refined = replace(refined, compared=images.compared_at(result.trajectory))
     if _support(refined.compared) >= _SUPPORTED:
         return refined
@@ -399,7 +403,7 @@ def _refined(
     )
     as_tracked = images.compared_at(tracked.trajectory[rows])
     if _support(as_tracked) > _support(refined.compared):
-        return _Refined(tracked.trajectory, tracked, views, as_tracked, False)
+        return _Refined(tracked.trajectory, tracked, views, as_tracked, False, refined.misread)
     return refined
 
 

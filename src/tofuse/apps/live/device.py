@@ -189,7 +189,7 @@ def device_named(name: str, options: Mapping[str, str]) -> Device:
     kinds = known_devices()
     if name not in kinds:
         raise InputError(
-            f"there is no camera {name!r}", where="record", remedy=f"use one of {list(kinds)}"
+            f"there is no camera {name!r}", where="record", remedy=f"use one of {', '.join(kinds)}"
         )
     types = typing.get_type_hints(kinds[name])
     values: dict[str, Any] = {"part": name}

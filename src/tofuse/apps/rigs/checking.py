@@ -112,10 +112,9 @@ def compare(previous: Rig, current: Rig, level: float = LEVEL) -> list[CameraMot
         if camera.name in motions:
             out.append(motions[camera.name])
             continue
-        reason = current.unplaced.get(camera.name, "")
-        out.append(
-            CameraMotion(camera.name, None, 1.0, False, reason=reason or "no recording of it")
-        )
+        alone = "the pose of no other camera was found"
+        reason = current.unplaced.get(camera.name, alone if camera in shared else "no recording")
+        out.append(CameraMotion(camera.name, None, 1.0, False, reason=reason))
     return out
 
 

@@ -86,9 +86,11 @@ def run_rig(
         inputs = list(recordings_of(rig_file).values())
     with using_threads(options.threads), threadpool_limits(1):
         progress.stage("opening")
-        cameras = open_cameras(inputs, options.format, list(recordings_of(rig_file)))
+        rig = read_rig(rig_file)
+        rig.check_count(len(inputs), rig_file)
+        cameras = open_cameras(inputs, options.format, [camera.name for camera in rig.cameras])
         recordings = [camera.recording for camera in cameras]
-        source = RigSource(read_rig(rig_file), recordings)
+        source = RigSource(rig, recordings)
         full_recording = Recording.of(source, " ".join(map(str, opening.paths)), "rig")
         recording = _selected(full_recording, source, options)
         config = resolve(options)

@@ -129,8 +129,9 @@ class Mapper:
             where there is none. It is a prior if the configuration has the part "odometry", or is
             a name and uses gravity.
         gravity
-            (4,) unit vector of gravity in the camera's frame, and its sigma in rad; None or NaN
-            where there is none.
+            (4,) unit vector of gravity in the camera's frame, (0, 1, 0) if it is level, and its
+            sigma in rad; None or NaN where there is none. An accelerometer at rest measures the
+            opposite.
         history
             Unfiltered frames just before this one, oldest first, for temporal filters; by default
             the frames pushed before.

@@ -91,5 +91,7 @@ def from_method(name: str, kind: ViewKind = "range") -> Config:
     """Return the configuration of that name for a kind of view; InputError if there is none."""
     available = methods()
     if not isinstance(name, str) or name not in available:
-        raise InputError(f"is {name!r}", where="--method", remedy=f"use one of {list(available)}")
+        raise InputError(
+            f"is {name!r}", where="--method", remedy=f"use one of {', '.join(available)}"
+        )
     return available[name](kind)

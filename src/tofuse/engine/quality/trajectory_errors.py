@@ -58,7 +58,8 @@ class TrajectoryError:
     coverage
         Fraction of the frames with a reference pose that have an estimated one, 0 to 1.
     ate_rms_m
-        Root mean square distance of the positions after alignment, m.
+        Root mean square distance of the positions after alignment, m; NaN, as all errors, if a
+        single pose is associated, which any other fits.
     ate_max_m
         The largest of these distances, m.
     rotation_rms_rad
@@ -103,9 +104,9 @@ class TrajectoryError:
             "associated": self.associated,
             "estimated": self.estimated,
             "coverage": self.coverage,
-            "ate_rms_m": self.ate_rms_m,
-            "ate_max_m": self.ate_max_m,
-            "rotation_rms_deg": float(np.degrees(self.rotation_rms_rad)),
+            "ate_rms_m": finite_or_none(self.ate_rms_m),
+            "ate_max_m": finite_or_none(self.ate_max_m),
+            "rotation_rms_deg": finite_or_none(np.degrees(self.rotation_rms_rad)),
             "rpe": [error.to_dict() for error in self.relative],
             "T_reference_estimate": self.T_reference_estimate.tolist(),
         }
@@ -142,9 +143,10 @@ def evaluate_trajectory(
     )
     if len(pairs) == 0:
         raise InputError(
-            f"no pose is within {MAX_GAP_S} s of a reference pose",
+            f"no pose is within {MAX_GAP_S} s of a reference pose: "
+            + spans(estimate_times, reference_times),
             where="timestamps",
-            remedy="use trajectories of the same recording, with times in seconds",
+            remedy="use trajectories of the same recording and clock, with times in seconds",
         )
     T_estimate, T_reference = estimate[pairs[:, 0]], reference[pairs[:, 1]]
     T_align = align(T_estimate, T_reference)
@@ -152,6 +154,8 @@ def evaluate_trajectory(
     errors = aligned[:, :3, 3] - T_reference[:, :3, 3]
     distances = np.linalg.norm(errors, axis=1)
     angles = angles_between(T_estimate, T_reference)
+    if len(pairs) == 1:
+        distances, angles = distances * np.nan, angles * np.nan
     return TrajectoryError(
         associated=len(pairs),
         coverage=_coverage(estimate_times, estimate, reference_times, reference, frame_times),
@@ -163,6 +167,15 @@ def evaluate_trajectory(
         pairs=pairs,
         estimated=int(np.isfinite(estimate).all((1, 2)).sum()),
     )
+
+
+def spans(times: ArrayLike, reference_times: ArrayLike) -> str:
+    """Return in words which times (N,) and (M,), s, a trajectory and its reference span."""
+    span, reference_span = (
+        f"{np.min(t):.10g} to {np.max(t):.10g} s" if np.size(t) else "none"
+        for t in (times, reference_times)
+    )
+    return f"times are {span}, those of the reference {reference_span}"
 
 
 def align(estimate: ArrayLike, reference: ArrayLike, arm_m: float | None = None) -> Float64:

@@ -9,6 +9,7 @@ import numpy as np
 from tofuse.engine.frames import frame_ranges
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.quantities import count, length
+from tofuse.engine.results.checks import TOLERANCE_RAD
 from tofuse.engine.results.types import Reason, Reconstruction
 from tofuse.engine.results.verdicts import ADVICE, ranked
 
@@ -41,6 +42,8 @@ def advice(reasons: Sequence[Reason]) -> str:
 def bound(accuracy: pose_accuracy.Accuracy, diagonal_m: float) -> str:
     """Return the accuracy of the poses as text: "±24 mm (95 %) over 6.2 m, 0.4 %".
 
+    With the bound of the orientations where that exceeds its tolerance: "±24 mm and 3.1° (95 %)".
+
     Parameters
     ----------
     accuracy
@@ -52,8 +55,11 @@ def bound(accuracy: pose_accuracy.Accuracy, diagonal_m: float) -> str:
         return "accuracy not assessed"
     if not np.isfinite(accuracy.position_m):
         return f"accuracy not bounded over {_extent(diagonal_m)}"
+    turned = ""
+    if TOLERANCE_RAD < accuracy.rotation_rad < np.inf:
+        turned = f" and {np.degrees(accuracy.rotation_rad):.2g}\N{DEGREE SIGN}"
     return (
-        f"±{length(accuracy.position_m)} (95 %) over {_extent(diagonal_m)}, "
+        f"±{length(accuracy.position_m)}{turned} (95 %) over {_extent(diagonal_m)}, "
         f"{100 * accuracy.relative:.2g} %"
     )
 

@@ -125,14 +125,15 @@ def read_poses(path: str | Path) -> TimedPoses:
         rows = list(rows_of(text))
         if not rows:
             raise InputError("contains no poses")
-        return _reader(rows)(rows, path)
+        first_line = text.splitlines()[rows[0][0] - 1]
+        return _reader(rows, with_commas="," in first_line)(rows, path)
 
 
 _Rows = Sequence[tuple[int, list[str]]]
 _Reader = Callable[[_Rows, Path], TimedPoses]
 
 
-def _reader(rows: _Rows) -> _Reader:
+def _reader(rows: _Rows, *, with_commas: bool) -> _Reader:
     """The reader of a text format, detected from the number of cells per line."""
     first = rows[0][1]
     count = len(first)
@@ -142,7 +143,8 @@ def _reader(rows: _Rows) -> _Reader:
         return _kitti
     if count >= 10 and not _is_number(first[9]):
         return _colmap
-    if count >= 8 and _is_number(first[0]) and float(first[0]) > _NANOSECONDS:
+    in_ns = count >= 8 and _is_number(first[0]) and float(first[0]) > _NANOSECONDS
+    if in_ns and (with_commas or count > 8):
         return _euroc
     if count == 8:
         return _tum
@@ -158,7 +160,10 @@ def _is_number(cell: str) -> bool:
 
 
 def _tum(_rows: _Rows, path: Path) -> TimedPoses:
+    """TUM's lines. ORB-SLAM3 writes such for EuRoC's recordings, with times in ns."""
     times, poses = read_tum(path)
+    if len(times) and times[0] > _NANOSECONDS:
+        times = 1e-9 * times
     return TimedPoses(poses, timestamps=times)
 
 

@@ -138,12 +138,7 @@ def _rig_source(
     """The recordings of a rig's cameras, in its order."""
     rig, recordings = read_rig(rig_file), []
     names = [camera.name for camera in rig.cameras]
-    if len(paths) != len(names):
-        raise InputError(
-            f"has {len(names)} cameras ({', '.join(names)}), and {len(paths)} recordings are given",
-            where=rig_file,
-            remedy="pass one recording for each, in this order",
-        )
+    rig.check_count(len(paths), rig_file)
     for name, path in zip(names, paths, strict=True):
         if not path.exists():
             raise InputError(

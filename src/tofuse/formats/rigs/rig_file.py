@@ -90,6 +90,20 @@ class Rig:
         """Return the camera called `name`; None if there is none."""
         return next((camera for camera in self.cameras if camera.name == name), None)
 
+    def check_count(self, count: int, where: str | Path) -> None:
+        """Raise InputError unless there are as many recordings as cameras with known poses."""
+        if count == len(self.cameras):
+            return
+        names = ", ".join(camera.name for camera in self.cameras)
+        remedy = "pass one recording for each, in this order"
+        if self.unplaced:
+            remedy += f", and none of {', '.join(self.unplaced)}, whose pose was not found"
+        raise InputError(
+            f"has {len(self.cameras)} cameras ({names}), and {count} recordings are given",
+            where=where,
+            remedy=remedy,
+        )
+
     def with_same_images(self, other: Rig) -> tuple[str, ...]:
         """Return the names of the cameras whose first image is that in another rig."""
         images = {(c.name, c.first_image) for c in other.cameras if c.first_image}

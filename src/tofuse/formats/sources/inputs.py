@@ -26,6 +26,9 @@ T = TypeVar("T")
 def required(files: list[T], name: str, where: Path, remedy: str = "check the path") -> list[T]:
     """Return the files; raise InputError, that `where` has no `name`, if there are none."""
     if not files:
+        if reading.is_folder(where) and (tiffs := reading.files_with(where, ".tif", ".tiff")):
+            name += f", but {len(tiffs)} .tif files"
+            remedy = "pass this folder itself, with --format tiff and --camera camera.json"
         raise InputError(f"has no {name}", where=where, remedy=remedy)
     return files
 
