@@ -157,8 +157,9 @@ def steps_of(method: AnyPair, count: int):
 def test_contradicted_registration_to_farther_view_is_rejected() -> None:
     """It places the third view 4 m off, in another room; that to the second one may be right."""
     searched = {(1, 0): (1.0, 0.99), (2, 1): (1.0, 0.4), (2, 0): (-2.0, 0.99)}
-    step = steps_of(LooksAlike(searched=searched), 3)[2]
-    assert step.component == 1
+    assert steps_of(LooksAlike(searched=searched, contradicted=(-4.0,)), 3)[2].component == 1
+    # What is free does not decide between both, and the other is less probable than not.
+    assert steps_of(LooksAlike(searched=searched), 3)[2].component == 0
     searched[2, 1] = (-3.0, 0.4)  # both agree
     assert steps_of(LooksAlike(searched=searched), 3)[2].component == 0
     # Free space excludes the other pose.
@@ -171,7 +172,7 @@ def test_contradicted_link_is_rejected() -> None:
     """Of the components {0, 1} and {2, 3}: a rejected registration led to another pose."""
     searched = {(1, 0): (1.0, 0.99), (2, 1): (1.0, 0.4), (2, 0): (-2.0, 0.1), (3, 2): (1.0, 0.99)}
     searched[3, 1] = (-2.0, 0.99)
-    for contradicted, links in (((), []), ((0.0,), [(1, 3)])):
+    for contradicted, links in (((-4.0,), []), ((0.0,), [(1, 3)])):
         steps = steps_of(LooksAlike(searched=searched, contradicted=contradicted), 4)
         assert [step.component for step in steps] == [0, 0, 1, 1]
         assert [(link.i, link.j) for link in steps[3].links] == links

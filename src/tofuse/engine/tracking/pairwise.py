@@ -32,6 +32,9 @@ from tofuse.engine.views import PreparedView
 _MIN_CONFIRMED = 2
 # Poses that differ by less than this fraction of the extent are the same.
 _MAX_DIFFERENCE = 0.03
+# Contradictions of two pairs of views, as fractions of the overlap, that differ by less are equal:
+# a few of the thousands of points that are compared.
+_CHANCE = 0.002
 
 # Seeds the random draws of odometry differently from other stages that register the same pair.
 SEED_STAGE = 1
@@ -319,7 +322,7 @@ class _PairwiseTracker(Tracker):
 
         Rooms that look alike fit each other better than neighbouring views do, which overlap less.
         So a higher probability does not decide, but what the views of both registrations see as
-        free does: the other pose must contradict that more.
+        free does. Where that contradicts both equally, the other pose must be probable.
         """
         if not found.registration.is_probable:
             return found
@@ -330,7 +333,8 @@ class _PairwiseTracker(Tracker):
                 sum(self._contradiction_at(at.T_components, pair) for pair in (found, other))
                 for at in (found, other)
             )
-            if of_other <= contradiction:
+            least = -_CHANCE if other.registration.is_probable else _CHANCE
+            if contradiction - of_other >= least:
                 reason = f"the registration to frame {other.reference.frame.index} contradicts it"
                 probability = found.probability / 2  # either may be right
                 registration = found.registration
