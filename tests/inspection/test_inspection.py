@@ -101,11 +101,12 @@ def test_facts_of_synthetic_frames() -> None:
 
 @pytest.mark.parametrize("z", [2000.0, 0.002])
 def test_wrong_unit_is_detected(z) -> None:
-    for frame in (image(z), CloudFrame.of(image(z).points)):
+    remedies = "Check depth_unit_m", f"multiply those in the files by {2 / z:g}"
+    for frame, remedy in zip((image(z), CloudFrame.of(image(z).points)), remedies, strict=True):
         (warning,) = (
             str(f) for f in inspect_recording(of([frame])).findings if f.code == "depth_unit"
         )
-        assert "depth_unit_m" in warning
+        assert remedy in warning
         assert f"{z:.2g}"[:1] in warning
 
 

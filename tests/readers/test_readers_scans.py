@@ -250,6 +250,10 @@ def test_e57(tmp_path: Path) -> None:
     assert np.allclose(reference[1][:3, :3], to_matrix(np.array([0, 0, half, half])))
     assert np.allclose(reference[1][:3, 3], [1.0, 0.0, 0.5])
 
+    (tmp_path / "more.e57").write_bytes(path.read_bytes())
+    folder = tofuse.open(tmp_path)  # scanners write a file for each scan
+    assert (folder.format, len(folder)) == ("e57", 4)
+
 
 def test_damaged_scans_are_refused_in_one_line(tmp_path: Path) -> None:
     pytest.importorskip("laspy")

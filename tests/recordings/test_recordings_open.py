@@ -308,3 +308,13 @@ def test_two_readers_keep_the_order() -> None:
     assert [item.index for item in items if isinstance(item, CloudFrame)] == list(range(40))
     assert len(source.names) == 2
     assert reader_threads() == []
+
+
+def test_scans_that_are_not_read_are_named_with_a_remedy(tmp_path) -> None:
+    for name, remedy in (("0.txt", "rename the files to .xyz"), ("0.PTX", "export the scans")):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / name).write_text("1 2 3\n")
+        for path in (folder, folder / name):
+            with pytest.raises(InputError, match=remedy):
+                open_recording(path)

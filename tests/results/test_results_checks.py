@@ -277,6 +277,16 @@ def test_rival_motion_leaves_the_choice_open() -> None:
     assert not judge(replace(evidence(), rivals=((3, 0.2),)))[1]
 
 
+def test_scans_from_tripods_are_not_compared_with_motion_of_a_camera() -> None:
+    jumps = evidence(steps=[(0.05 * k + 0.4 * (k > 4), 0, 0, 0, 0, 0) for k in range(9)])
+    untimed = tuple(replace(r, timestamp=float(r.index)) for r in jumps.records)
+    scans = replace(jumps, scans=True, records=untimed)
+    assert codes(scans) == []
+    assert codes(replace(jumps, scans=True)) == ["jumped"]
+    (reason,) = judge(replace(scans, doubtful=(2,)))[1]
+    assert "camera" not in reason.text
+
+
 def test_jump_that_another_sensor_measured_is_expected() -> None:
     jumps = evidence(steps=[(0.05 * k + 0.4 * (k > 4), 0, 0, 0, 0, 0) for k in range(9)])
     assert codes(jumps) == ["jumped"]

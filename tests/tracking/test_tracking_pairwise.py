@@ -123,3 +123,56 @@ def test_odometry_that_contradicts_searches_is_not_used() -> None:
     assert steps[1].doubtful
     assert steps[2].doubtful
     assert steps[3].component == 1
+
+
+@dataclass(frozen=True)
+class LooksAlike(AnyPair):
+    """Searches of (source, target) lead to scripted positions; what is free contradicts some.
+
+    `searched` holds the position of the source's component in the target's, which is the view's as
+    long as all are a metre apart, and the probability.
+    """
+
+    searched: dict[tuple[int, int], tuple[float, float]] = field(default_factory=dict)
+    contradicted: tuple[float, ...] = ()
+
+    def register(self, source, target, guess, rng):
+        x, p = self.searched.get((source.index, target.index), (0.0, 0.1))
+        if not self.search:
+            x, p = float(guess[0, 3]), 0.95
+        offset = x - (source.index - target.index)  # from the right pose
+        return Registration(
+            se3.exp(np.array([x, 0, 0, 0, 0, 0])), True, 1, 100, 100, 0.0, 0.0, np.eye(6),
+            believed=p >= 0.9, probability=p, reason="doubtful",
+            contradiction=0.01 if round(offset, 6) in self.contradicted else 0.0,
+        )  # fmt: skip
+
+
+def steps_of(method: AnyPair, count: int):
+    tracker = Pairwise(registration=method, guess="identity").start(0)
+    points = np.random.default_rng(0).uniform(-1, 1, (40, 3)).astype(np.float32)
+    return [tracker.push(CloudFrame(k, float(k), points)) for k in range(count)]
+
+
+def test_contradicted_registration_to_farther_view_is_rejected() -> None:
+    """It places the third view 4 m off, in another room; that to the second one may be right."""
+    searched = {(1, 0): (1.0, 0.99), (2, 1): (1.0, 0.4), (2, 0): (-2.0, 0.99)}
+    assert steps_of(LooksAlike(searched=searched, contradicted=(-4.0,)), 3)[2].component == 1
+    # What is free does not decide between both, and the other is less probable than not.
+    assert steps_of(LooksAlike(searched=searched), 3)[2].component == 0
+    searched[2, 1] = (-3.0, 0.4)  # both agree
+    assert steps_of(LooksAlike(searched=searched), 3)[2].component == 0
+    # Free space excludes the other pose.
+    searched |= {(2, 1): (-3.0, 0.4), (2, 0): (2.0, 0.99)}
+    step = steps_of(LooksAlike(searched=searched, contradicted=(-4.0,)), 3)[2]
+    assert (step.component, step.reference, step.doubtful) == (0, 0, False)
+
+
+def test_contradicted_link_is_rejected() -> None:
+    """Of the components {0, 1} and {2, 3}: a rejected registration led to another pose."""
+    searched = {(1, 0): (1.0, 0.99), (2, 1): (1.0, 0.4), (2, 0): (-2.0, 0.1), (3, 2): (1.0, 0.99)}
+    searched[3, 1] = (-2.0, 0.99)
+    for contradicted, links in (((-4.0,), []), ((0.0,), [(1, 3)])):
+        steps = steps_of(LooksAlike(searched=searched, contradicted=contradicted), 4)
+        assert [step.component for step in steps] == [0, 0, 1, 1]
+        assert [(link.i, link.j) for link in steps[3].links] == links

@@ -89,10 +89,13 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
         return
     # The power of ten by which the distance is nearest to 2 m.
     factor = float(10.0 ** np.round(np.log10(median / 2.0)))
+    remedy = f"Check depth_unit_m: it may be wrong by a factor of {factor:g}."
+    if not sample.images:
+        remedy = f"Coordinates are read as metres: multiply those in the files by {1 / factor:g}."
     yield Finding(
         "depth_unit",
         f"The median depth is {median:.3g} m, {problem}.",
-        f"Check depth_unit_m: it may be wrong by a factor of {factor:g}.",
+        remedy,
         evidence | {"factor": factor},
     )
 

@@ -34,7 +34,6 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import (
     Config,
     adaptation,
-    check_views,
     clips,
     from_method,
     reconstructing,
@@ -203,6 +202,12 @@ def judge(
     check_one_camera(recording)
     given_poses = poses_for(recording, trajectory)
     kind = reconstructing.view_kind(recording)
+    if kind == "cloud":
+        raise InputError(
+            "contains clouds, and poses are judged by depth images",
+            where=recording.path,
+            remedy="compare the poses with a reference: tofuse evaluate",
+        )
     # External sensors do not measure these poses, and images are compared with the stated camera.
     config = replace(
         from_method("default", kind), tolerance_m=tolerance_m, priors=(), self_calibration=False
@@ -210,7 +215,6 @@ def judge(
     given_config = replace(
         config, odometry=given.GivenPoses(), refinement=Joint(neighbours=_NEIGHBOURS)
     )
-    check_views(given_config, kind)
     images = _Images(_sample_of(recording, given_poses), recording)
     with use_threads(threads), threadpool_limits(1):
         progress.stage("comparing images")

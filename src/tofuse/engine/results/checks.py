@@ -289,6 +289,8 @@ def _motion(e: Evidence) -> Iterator[Reason]:
         for jump in find_jumps(poses, moments, unexpected)
         if e.records[jump[0]].index not in e.measured
     ]
+    if e.scans and not any(moment.is_timed for moment in moments):
+        pose_jumps = []  # from tripods, perhaps: no motion predicts the next
     frames = [e.records[k].index for k, _ in pose_jumps]
     if len(pose_jumps) > max(MIN_UNORDERED, UNORDERED_FRACTION * sum(has_pose)):
         text = (
@@ -457,7 +459,12 @@ def _scene(e: Evidence) -> Iterator[Reason]:
         )
         yield Reason("open_motion", where, text)
     doubtful = e.runs_of(e.doubtful)
-    if doubtful:
+    if doubtful and e.scans:
+        text = (
+            f"The registration of {frame_ranges.in_words(doubtful)} is probable, but not accepted."
+        )
+        yield Reason("doubtful_poses", doubtful, text)
+    elif doubtful:
         description = (
             "fitted its keyframe worse than this camera's views usually do; look at it first."
             if frame_ranges.is_single(doubtful)

@@ -98,7 +98,8 @@ ADVICE: dict[str, str] = {
     "self_calibrated": "Copy the corrected values into camera.json, and check a known distance.",
     "unobserved_motion": "Keep corners, furniture or texture in view there.",
     "bounded_by_motion": "Keep corners, furniture or texture in view there.",
-    "unchecked_drift": "Return to the start, so that a loop closure can correct the drift.",
+    "unchecked_drift": "Check a known distance, or return to the start, so that a loop closure can "
+    "correct the drift.",
     "loop_gap": "Distances across the loop may be distorted; check one that you know.",
     "optimiser_gave_up": "Allow the optimiser more iterations.",
 }

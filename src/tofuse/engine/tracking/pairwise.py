@@ -7,13 +7,14 @@ baselines: to several earlier ones, and verified.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
 
 from tofuse.engine.alignment import PROBABLE, Link, Registrar, Registration
-from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.clouds import AnyPair
 from tofuse.engine.errors import RegistrationError
@@ -31,6 +32,9 @@ from tofuse.engine.views import PreparedView
 _MIN_CONFIRMED = 2
 # Poses that differ by less than this fraction of the extent are the same.
 _MAX_DIFFERENCE = 0.03
+# Contradictions of two pairs of views, as fractions of the overlap, that differ by less are equal:
+# a few of the thousands of points that are compared.
+_CHANCE = 0.002
 
 # Seeds the random draws of odometry differently from other stages that register the same pair.
 SEED_STAGE = 1
@@ -210,6 +214,7 @@ class _PairwiseTracker(Tracker):
         self._component = -1
         self._connected = True  # whether links join the component to an earlier one
         self._motion = MotionModel()
+        self._rejected: list[_Registered] = []  # of the component's first view, to earlier ones
         self._degenerate = False  # whether some direction of the last motion was degenerate
         self._local_registration = replace(options.registration, search=False)
         self._T_odometry: Float64 | None = None  # of the present view
@@ -238,25 +243,29 @@ class _PairwiseTracker(Tracker):
             return self._continue_component(frame, local)
         doubtful: list[_Registered] = []
         for reference in references:
-            registered = self._by_search(frame, reference)
-            if registered is not None and reference is references[0]:
-                registered = self._confirmed_by_odometry(frame, registered, local)
-            if registered is not None and registered.accepted:
+            registered = self._by_search(_unposed(frame), reference)
+            if registered is None:
+                continue
+            if reference is references[0]:
+                registered = self._confirmed_by_odometry(registered, local)
+            registered = self._unless_contradicted(registered, doubtful)
+            if registered.accepted:
                 if reference is references[0]:
-                    self._motion_confirmed.append(
-                        local is not None and local.agrees(registered, frame.points)
-                    )
+                    self._motion_confirmed.append(local is not None and local.agrees(registered))
                 return self._continue_component(frame, registered)
-            if registered is not None:
-                doubtful.append(registered)
+            doubtful.append(registered)
         if confirmed and self._has_odometry and local is not None and local.accepted:
             return self._continue_component(frame, local)
-        links = self._links(frame)
         # The latest views overlap most with this one.
         probable = [r for r in doubtful if r.probability >= self._options.probable]
+        if probable:
+            placed = _PosedView(frame, probable[0].T_components, self._component)
+            links = self._links(placed, self._rejected)
+        else:
+            links = self._links(_unposed(frame))
         if probable and not links:
             return self._continue_component(frame, probable[0])
-        return self._begin_component(frame, links, doubtful[0] if doubtful else None)
+        return self._begin_component(frame, links, doubtful)
 
     def _by_prediction(self, frame: Frame, last: _PosedView) -> _Registered | None:
         """Register to the last view from the predicted pose.
@@ -276,34 +285,73 @@ class _PairwiseTracker(Tracker):
         motion = _odometry_motion(last.T_odometry, self._T_odometry)
         if self._options.guess == "odometry" and motion is not None:
             guess, self._has_odometry = motion, True
-        return self._registered(frame, last, guess, self._local_registration)
+        return self._registered(_unposed(frame), last, guess, self._local_registration)
 
     def _confirmed_by_odometry(
-        self, frame: Frame, searched: _Registered, local: _Registered | None
+        self, searched: _Registered, local: _Registered | None
     ) -> _Registered:
         """Accept the best pose of a search if odometry, independent of it, leads there too.
 
         Odometry excludes the rivals of the search: the probability near the guess counts.
         """
-        if local is None or not self._has_odometry or not local.agrees(searched, frame.points):
+        if local is None or not self._has_odometry or not local.agrees(searched):
             return searched
         if local.probability < self._options.probable:
             return searched
         registration = replace(searched.registration, believed=True, reason="", confirmed=True)
         return replace(searched, registration=registration)
 
-    def _by_search(self, frame: Frame, reference: _PosedView) -> _Registered | None:
+    def _by_search(self, view: _PosedView, reference: _PosedView) -> _Registered | None:
         """Register to an earlier view by a global search."""
-        return self._registered(frame, reference, None, self._options.registration)
+        return self._registered(view, reference, None, self._options.registration)
 
     def _registered(
-        self, frame: Frame, reference: _PosedView, guess: Float64 | None, method: AnyPair
+        self, view: _PosedView, reference: _PosedView, guess: Float64 | None, method: AnyPair
     ) -> _Registered | None:
-        rng = np.random.default_rng([self._seed, SEED_STAGE, frame.index, reference.frame.index])
+        frame, target = view.frame, reference.frame
+        rng = np.random.default_rng([self._seed, SEED_STAGE, frame.index, target.index])
         try:
-            return _Registered(reference, method.register(frame, reference.frame, guess, rng))
+            return _Registered(view, reference, method.register(frame, target, guess, rng))
         except RegistrationError:
             return None
+
+    def _unless_contradicted(
+        self, found: _Registered, others: Sequence[_Registered]
+    ) -> _Registered:
+        """Reject a pose if one that was found relative to another view may be right as well.
+
+        Rooms that look alike fit each other better than neighbouring views do, which overlap less.
+        So a higher probability does not decide, but what the views of both registrations see as
+        free does. Where that contradicts both equally, the other pose must be probable.
+        """
+        if not found.registration.is_probable:
+            return found
+        for other in others:
+            if found.agrees(other):
+                continue
+            contradiction, of_other = (
+                sum(self._contradiction_at(at.T_components, pair) for pair in (found, other))
+                for at in (found, other)
+            )
+            least = -_CHANCE if other.registration.is_probable else _CHANCE
+            if contradiction - of_other >= least:
+                reason = f"the registration to frame {other.reference.frame.index} contradicts it"
+                probability = found.probability / 2  # either may be right
+                registration = found.registration
+                return replace(
+                    found,
+                    registration=replace(
+                        registration, believed=False, probability=probability, reason=reason
+                    ),
+                )
+        return found
+
+    def _contradiction_at(self, T_components: Float64, pair: _Registered) -> float:
+        """Return the contradiction of the views of a registration if components are so posed."""
+        view, reference = pair.view, pair.reference
+        guess = se3.inverse(reference.T_component_view) @ T_components @ view.T_component_view
+        local = self._registered(view, reference, guess, self._local_registration)
+        return 0.0 if local is None else local.registration.contradiction or 0.0
 
     def _continue_component(self, frame: Frame, registered: _Registered) -> Step:
         """Take the pose of a registration to a view of the present component."""
@@ -311,9 +359,10 @@ class _PairwiseTracker(Tracker):
         T = se3.orthonormalise(reference.T_component_view @ registration.T_target_source)
         self._motion.update(T, _moment(frame))
         self._degenerate = len(registration.unobservable) > 0
-        links = () if self._connected else self._links(frame)
+        posed = _PosedView(frame, T, self._component, self._T_odometry)
+        links = () if self._connected else self._links(posed, self._rejected)
         self._connected |= bool(links)
-        self._posed.append(_PosedView(frame, T, self._component, self._T_odometry))
+        self._posed.append(posed)
         return Step(
             "tracked",
             "" if registered.accepted else registration.reason,
@@ -326,31 +375,46 @@ class _PairwiseTracker(Tracker):
         )
 
     def _begin_component(
-        self, frame: Frame, links: tuple[Link, ...], rejected: _Registered | None
+        self, frame: Frame, links: tuple[Link, ...], rejected: list[_Registered]
     ) -> Step:
         self._component += 1
+        self._rejected = rejected
         self._connected = self._component == 0 or bool(links)
         self._motion.interrupt()
         self._motion.update(np.eye(4), _moment(frame))
         self._posed.append(_PosedView(frame, np.eye(4), self._component, self._T_odometry))
-        reason = "" if rejected is None else f"not connected: {rejected.registration.reason}"
+        reason = f"not connected: {rejected[0].registration.reason}" if rejected else ""
         return Step("tracked", reason, np.eye(4), component=self._component, links=links)
 
-    def _links(self, frame: Frame) -> tuple[Link, ...]:
-        """Return the registration to the last view of another component, if it is accepted."""
+    def _links(self, view: _PosedView, rejected: Sequence[_Registered] = ()) -> tuple[Link, ...]:
+        """Return the registration to the last view of another component, if it is accepted.
+
+        `rejected` are others between both components.
+        """
         others = [p for p in self._posed if p.component != self._component]
-        registered = self._by_search(frame, others[-1]) if others else None
-        return (registered.link(frame),) if registered is not None and registered.accepted else ()
+        registered = self._by_search(view, others[-1]) if others else None
+        if registered is None:
+            return ()
+        component = registered.reference.component
+        between = [r for r in rejected if r.reference.component == component]
+        registered = self._unless_contradicted(registered, between)
+        return (registered.link(),) if registered.accepted else ()
 
 
 def _moment(frame: Frame) -> FrameTime:
     return FrameTime(frame.index, frame.timestamp)
 
 
+def _unposed(frame: Frame) -> _PosedView:
+    """Return a view as a component of its own."""
+    return _PosedView(frame, np.eye(4), -1)
+
+
 @dataclass(frozen=True, eq=False)
 class _Registered:
-    """A registration to an earlier view."""
+    """A registration of a view to an earlier one."""
 
+    view: _PosedView
     reference: _PosedView
     registration: Registration
 
@@ -366,9 +430,16 @@ class _Registered:
         )
         return self.accepted and certain
 
-    def agrees(self, other: _Registered, points: Float32) -> bool:
-        """Whether both map points (n, 3) to the same place, relative to their extent."""
-        T, T_other = (r.registration.T_target_source for r in (self, other))
+    @property
+    def T_components(self) -> Float64:
+        """Pose (4, 4) of the view's component in that of the reference."""
+        T = self.reference.T_component_view @ self.registration.T_target_source
+        return T @ se3.inverse(self.view.T_component_view)
+
+    def agrees(self, other: _Registered) -> bool:
+        """Whether both map the view's points to the same place, relative to their extent."""
+        points = self.view.frame.points
+        T, T_other = (r.T_components @ self.view.T_component_view for r in (self, other))
         difference = se3.transform(T, points) - se3.transform(T_other, points)
         rms = np.sqrt((difference**2).sum(1).mean())
         return bool(rms <= _MAX_DIFFERENCE * extent(points))
@@ -377,6 +448,6 @@ class _Registered:
     def probability(self) -> float:
         return self.registration.probability or 0.0
 
-    def link(self, frame: Frame) -> Link:
-        r = self.registration
-        return Link(self.reference.frame.index, frame.index, r, self.accepted, r.how)
+    def link(self) -> Link:
+        i, j, r = self.reference.frame.index, self.view.frame.index, self.registration
+        return Link(i, j, r, self.accepted, r.how)

@@ -168,6 +168,8 @@ def _las_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
 class E57Scans(Reader):
     """A .e57 file: one view per scan, in its frame; poses as reference (extra `scan`)."""
 
+    joinable = True
+
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         return (

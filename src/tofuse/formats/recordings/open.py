@@ -48,6 +48,12 @@ _ARCHIVES = {".zip", ".tar", ".gz", ".tgz", ".7z", ".rar"}
 
 # A single file of these, which contain a whole recording, is that of its folder.
 _CONTAINERS = (".bag", ".db3", ".mcap", ".mkv", ".sens", ".r3d", ".npz", ".h5", ".e57")
+# What to do with scans that are not read, by suffix.
+_CLOUDS = {
+    ".txt": "if the lines are x y z of a cloud, rename the files to .xyz",
+    ".csv": "if the lines are x y z of a cloud, rename the files to .xyz",
+    ".ptx": "export the scans as .e57, .ply or .xyz",
+}
 
 # A folder with these may contain depth images of an unknown camera.
 _IMAGES = (".png", ".pgm", ".tif", ".tiff", ".jpg", ".jpeg")
@@ -325,12 +331,15 @@ def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) ->
         kinds = Counter((p.suffix or "no suffix") if p.is_file() else "folders" for p in children)
         evidence = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(4))
         problem = f"is not a recording of a known format: it contains {evidence}"
+        most = kinds.most_common(1)[0][0] if kinds else ""
+        remedy = _CLOUDS.get(most.lower(), remedy)
         if any(kind.lower() in _IMAGES for kind in kinds):
             remedy = "if these are depth images, move them to depth/ in it and add a camera.json"
     elif path.stat().st_size == 0:
         return InputError("is empty", where=path, remedy="copy the file again")
     else:
         problem = f"is not a recording of a known format, but a {path.suffix!r} file"
+        remedy = _CLOUDS.get(path.suffix.lower(), remedy)
     folder = path.absolute().parent
     if _is_sure(folder):
         return InputError(problem, where=path, remedy=f"pass the recording's folder, {folder}")
