@@ -226,7 +226,7 @@ CONFIGS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "unknown part": ("[[filters]]\npart = 'magic'", ("filters[0]", "'magic'", "'median'")),
     "number for a part": ("odometry = 3", ("odometry", "is 3", "'sequential'")),
-    "unknown method": ("method = 'magic'", ("'magic'", "'thesis'")),
+    "unknown method": ("method = 'magic'", ("'magic'", "default, thesis")),
 }
 
 
