@@ -182,6 +182,7 @@ def test_convention_of_inverted_poses_is_named(recording, truth):
     assert judged.cause is None
     (named,) = [text for text in notes.texts if "The poses fit the images if" in text]
     assert "T_camera_world, the inverse" in named
+    assert judged.to_dict()["finding"]["code"] == "poses_misread"
     quiet = Notes()
     tofuse.judge(recording, truth, progress=quiet)
     assert not [text for text in quiet.texts if "The poses" in text]

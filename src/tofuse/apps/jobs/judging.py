@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from tofuse.apps.inspection import convention_of
+from tofuse.apps.inspection import Finding, convention_of
 from tofuse.apps.jobs import pose_scale
 from tofuse.apps.results import folders, run_json, stated_accuracy, write_result
 from tofuse.engine.arrays import Float64, Intp
@@ -109,6 +109,8 @@ class Judgement:
         Metres per unit of the poses as given; None if it can't be estimated, as from rotations.
     cause
         What is wrong with the poses, if one cause explains the deviation.
+    finding
+        That the poses fit in another convention or scale, if they do.
     """
 
     poses: Float64
@@ -123,6 +125,7 @@ class Judgement:
     started: bool = True
     scale: pose_scale.PoseScale | None = None
     cause: pose_causes.Cause | None = None
+    finding: Finding | None = None
     _reconstruct: Callable[[], Reconstruction] = field(kw_only=True, repr=False)
 
     @cached_property
@@ -145,6 +148,7 @@ class Judgement:
             "deviation": _dict(self.deviation),
             "displacement_m": self.displacement_m,
             "cause": _dict(self.cause),
+            "finding": _dict(self.finding),
             "scale": None if self.scale is None else asdict(self.scale),
             "refined": {
                 "from_these_poses": self.started,
@@ -229,7 +233,9 @@ def judge(
         )
         deviation = _deviation(poses, refined.poses, used, images.row_of)
         cause = None
-        if deviation is not None and not refined.misread:  # which looks like drift
+        # Another convention looks like drift.
+        is_misread = refined.finding is not None and refined.finding.code == "poses_misread"
+        if deviation is not None and not is_misread:
             velocity = _velocities(recording, poses)[[images.row_of[v.index] for v in used]]
             cause = pose_causes.cause_of(deviation, velocity)
         consistency, refined_consistency = _consistencies(
@@ -274,6 +280,7 @@ def judge(
         refined.started,
         estimate,
         cause,
+        refined.finding,
         _reconstruct=reconstruct,
     )
 
@@ -354,8 +361,8 @@ class _Refined:
         The images at these poses.
     started
         Whether they were refined from the given ones.
-    misread
-        Whether the given ones fit in another convention.
+    finding
+        That the given ones fit in another convention or scale, if they do.
     """
 
     poses: Float64
@@ -363,7 +370,7 @@ class _Refined:
     views: Views
     compared: cross_view_agreement.CrossViewConsistency
     started: bool
-    misread: bool = False
+    finding: Finding | None = None
 
 
 def _refined(
@@ -398,7 +405,7 @@ def _refined(
         return refined
     if finding := convention_of(recording, poses):
         progress.note(str(finding))
-        refined = replace(refined, misread=finding.code == "poses_misread")
+        refined = replace(refined, finding=finding)
     refined = replace(refined, compared=images.compared_at(result.trajectory))
     if _support(refined.compared) >= _SUPPORTED:
         return refined
@@ -407,7 +414,7 @@ def _refined(
     )
     as_tracked = images.compared_at(tracked.trajectory[rows])
     if _support(as_tracked) > _support(refined.compared):
-        return _Refined(tracked.trajectory, tracked, views, as_tracked, False, refined.misread)
+        return _Refined(tracked.trajectory, tracked, views, as_tracked, False, refined.finding)
     return refined
 
 
