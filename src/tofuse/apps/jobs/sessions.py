@@ -130,7 +130,7 @@ def _links(
 
 def _odometry_scale(run: Mapping[str, Any]) -> float | None:
     """Return the factor on the errors of the odometry that a path rests on; None if it doesn't."""
-    records = (external_sensors.SensorRecord(**p) for p in run["priors"])
+    records = (external_sensors.SensorRecord(**p) for p in run.get("priors", ()))
     used = [r for r in records if r.sensor == "odometry" and r.used]
     reliable = external_sensors.SensorPriors(records=tuple(used)).is_reliable
     return used[0].scale if used and reliable else None
