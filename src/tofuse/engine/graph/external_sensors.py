@@ -284,8 +284,8 @@ class OdometryEdges(Bounded, ExternalSensor):
     gate
         Squared error of a step, in units of the errors of both, beyond which it is rejected.
     scale
-        Factor on its errors; None: estimated. If known, it is no question whether odometry that
-        agrees with the path is evidence, as where a path rests on it.
+        Factor on its errors; None: estimated by comparison with the tracked motion. It is given
+        where the path rests on this odometry already, so that their agreement shows nothing.
     """
 
     drift_m: Annotated[float, Bounds(1e-6, 10)] = 0.005

@@ -290,9 +290,9 @@ def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Reco
 def with_known_odometry(
     recording: Recording, config: Config, scale: float | None
 ) -> tuple[Recording, Config]:
-    """Return both with odometry whose errors have a known factor; or without it, if that is None.
+    """Return both with a known factor on the errors of odometry; without odometry if it is None.
 
-    Of a recording whose path rests on its odometry already, see `OdometryEdges.scale`.
+    For a recording whose path rests on its odometry already, see `OdometryEdges.scale`.
     """
     if scale is None:
         sensors = (p for p in config.priors if not isinstance(p, external_sensors.OdometryEdges))

@@ -215,7 +215,7 @@ class _Tracked:
 
         With a shortcut, all that agrees is against a rival that can't matter.
         """
-        total = np.zeros((2, len(_CENTRES)))
+        total = np.zeros((2, _BINS))
         T, visible = self.T_reference_view, sum(self._visible)
         if _shift(self.view, se3.inverse(T) @ T_rival) < _MIN_SHIFT:
             return _Evidence(total, 0)
@@ -229,10 +229,8 @@ class _Tracked:
             ratios = likelihood_ratios(a, b, *motions, self.scale, outcome)
             used, stride = np.isfinite(ratios), stride_of(a)
             bins = ((ratios[used] / _MAX_LLR + 1) * (0.5 * _BINS)).astype(np.intp)
-            bins, area = (
-                np.minimum(bins, _BINS - 1),
-                a.z[::stride, ::stride][used].astype(float) ** 2,
-            )
+            bins = np.minimum(bins, _BINS - 1)
+            area = a.z[::stride, ::stride][used].astype(np.float64) ** 2
             for row, weights in zip(total, (None, area), strict=True):
                 row += np.bincount(bins, weights, _BINS)
         total[1] *= total[0].sum() / max(total[1].sum(), 1e-9)
