@@ -283,7 +283,7 @@ def _registered(
         return registration
     blind = views.without_free_space()
     other = _registered_views(blind, guess, image_registration, **options)
-    if other.believed:  # that the free space contradicts it is no less true than the viewpoint
+    if other.believed:  # nothing shows which of the two is wrong: the pose or the viewpoint
         reason = "its free space contradicts it, if a cloud was seen from its origin"
         other = replace(other, believed=False, probability=_LIKELY, reason=reason)
     return max(registration, other, key=lambda found: found.probability or 0.0)

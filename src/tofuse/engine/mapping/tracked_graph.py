@@ -76,8 +76,8 @@ class TrackedGraph:
         sequential_edges = [
             edge
             for entry in self.posed
-            if (edge := _sequential_edge(entry, predicted, confirmed)) is not None
-            and not {edge.i, edge.j} <= refined
+            if not (entry.step and {entry.step.reference, entry.record.index} <= refined)
+            and (edge := _sequential_edge(entry, predicted, confirmed)) is not None
         ]
         join_edges = [
             Measured(j.link.i, j.link.j, j.link.T_i_j, j.link.information)

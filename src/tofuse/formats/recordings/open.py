@@ -50,8 +50,9 @@ _ARCHIVES = {".zip", ".tar", ".gz", ".tgz", ".7z", ".rar"}
 _CONTAINERS = (".bag", ".db3", ".mcap", ".mkv", ".sens", ".r3d", ".npz", ".h5", ".e57")
 # What to do with scans that are not read, by suffix.
 _CLOUDS = {
-    ".txt": "if the lines are x y z of a cloud, rename the files to .xyz",
-    ".csv": "if the lines are x y z of a cloud, rename the files to .xyz",
+    **dict.fromkeys(
+        (".txt", ".csv"), "if the lines are x y z of a cloud, rename the files to .xyz"
+    ),
     ".ptx": "export the scans as .e57, .ply or .xyz",
 }
 
