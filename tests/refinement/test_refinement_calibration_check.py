@@ -12,6 +12,7 @@ from aligned_surfaces import OPTIONS, SHARP, path, surfaces
 from corner_views import BARREL, CAMERA, corner
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.trajectory_errors import displacement
+from tofuse.engine.refinement import calibration_check
 from tofuse.engine.refinement.calibration_check import (
     CalibrationCheck,
     check_calibration,
@@ -96,6 +97,33 @@ def test_correct_camera_raises_no_alarm():
     assert found.gap is None
     # What the views estimate still counts: less than the uncertainty of the estimate.
     assert 0 < found.moved[0] < 3 * found.focal_sigma * found.motion["focal"][0]
+
+
+@pytest.mark.parametrize(("remaining_m", "alarm"), [(0.004, False), (0.006, True)])
+def test_drift_that_a_usual_focal_length_explains_better_is_no_offset(
+    monkeypatch, remaining_m, alarm
+):
+    """Both close the loop, and the views confirm both: 0.3 % of the focal length, or 5 cm."""
+    errors, gaps = {kernels.FOCAL: 0.003, kernels.OFFSET: 0.05}, {0.003: remaining_m, 0.05: 0.005}
+
+    class ToldLoop(Loop):
+        def aligned(self, steps, errors):
+            return 0.02
+
+        def closing_error(self, uncorrected, error_index, step):
+            return errors[error_index], errors[error_index]
+
+        def gap(self, before, after):
+            return Gap(0, 11, (before, 0.0), (gaps.get(after, before), 0.0), 1.5)
+
+        def error_by_views(self, steps, error_index, error):
+            return error
+
+    monkeypatch.setattr(calibration_check, "Loop", ToldLoop)
+    views, refined = kept(0.0)
+    found = check_calibration(RefinedViews(views, refined, OPTIONS))
+    assert found.alarm == alarm
+    assert found.errors == ({"offset": 0.05} if alarm else {})
 
 
 def test_few_views_determine_nothing_and_say_what_it_would_do():

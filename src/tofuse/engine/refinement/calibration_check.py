@@ -441,7 +441,7 @@ def _check_by_loop(
     A large error leaves a gap that a refinement may close by matching wrong surfaces. Then its
     residuals reveal nothing. Pairwise alignments from the poses before it don't depend on it. But
     any drift leaves a gap that some error of the camera nearly closes: the views must confirm the
-    error.
+    error, and no smaller one, as usual cameras have it, may close the gap better.
 
     Parameters
     ----------
@@ -459,29 +459,32 @@ def _check_by_loop(
     if not loop.gap(uncorrected, uncorrected).significant:
         return without_error
 
-    def revealed(name: str) -> tuple[float, Gap] | None:
+    def explained(name: str) -> tuple[float, Gap, bool] | None:
         step = _LOOP_FACTOR * TOLERANCES[name]
         error, corrected = loop.closing_error(uncorrected, _INDEX[name], step)
         gap = loop.gap(uncorrected, corrected)
-        limit = without_error.significance * first.sigmas[name]
-        if not (gap.closes and _large(name, error, limit, _LOOP_FACTOR)):
+        if not gap.closes:
             return None
         confirmed = loop.error_by_views(corrected, _INDEX[name], error)
-        is_confirmed = _large(name, confirmed, limit, _LOOP_FACTOR)
-        return (error, gap) if is_confirmed and confirmed / error > _MIN_CONFIRMED else None
+        limit = without_error.significance * first.sigmas[name]
+        large = all(_large(name, e, limit, _LOOP_FACTOR) for e in (error, confirmed))
+        return (error, gap, large) if confirmed * error > _MIN_CONFIRMED * error**2 else None
 
     names = [name for name in _REVEALED_BY_LOOP if name in first.determined]
-    found = run_all([partial(revealed, name) for name in names])
-    candidates = {name: of for name, of in zip(names, found, strict=True) if of is not None}
-    if not candidates:
+    found = run_all([partial(explained, name) for name in names])
+    explanations = {name: of for name, of in zip(names, found, strict=True) if of is not None}
+    if not explanations:
         return without_error
-    best = min(candidates, key=lambda name: candidates[name][1].remaining_m)
+    best = min(explanations, key=lambda name: explanations[name][1].remaining_m)
+    _, gap, is_large = explanations[best]
+    if not is_large:
+        return without_error
     return replace(
         without_error,
         alarm=True,
-        errors={name: error for name, (error, _) in candidates.items()},
-        sigmas={name: first.sigmas[name] for name in candidates},
-        gap=candidates[best][1],
+        errors={name: error for name, (error, _, large) in explanations.items() if large},
+        sigmas={name: first.sigmas[name] for name, (*_, large) in explanations.items() if large},
+        gap=gap,
         best=best,
     )
 
