@@ -36,8 +36,11 @@ from tofuse.engine.results.types import Reconstruction
 from tofuse.lab.scenes import flat, furniture
 from tofuse.lab.scenes.composition import Assembly, placed
 from tofuse.lab.simulation.effects import Effects
+from tofuse.lab.simulation.phone import NAME as PHONE
+from tofuse.lab.simulation.phone import PhonePlan, plan_phone, write_phone
 from tofuse.lab.simulation.record import RecordingPlan, plan, write
 from tofuse.lab.world import paths
+from tofuse.lab.world.scene import Sequence as Motion
 
 OUT = Path(__file__).resolve().parent / "out" / "recordings" / "sessions"
 RUNS = Path(__file__).resolve().parent / "out" / "sessions"
@@ -72,8 +75,8 @@ class Tour:
     chair: float | None = 0.0
     refurnished: bool = False
 
-    def plan(self) -> RecordingPlan:
-        """The plan of the simulation."""
+    def plan(self) -> tuple[RecordingPlan | PhonePlan, Float64]:
+        """The plan of the simulation, and (N, 4, 4) true T_flat_camera."""
         with ExitStack() as stack:
             if self.scene == "flat":
                 rooms = list(flat._FURNISHED)
@@ -81,27 +84,29 @@ class Tour:
                 if self.chair is not None:
                     rooms[1] = with_chair(rooms[1], self.chair)
                 stack.enter_context(mock.patch.object(flat, "_FURNISHED", rooms))
-            made = plan(
-                self.scene,
-                camera=self.camera,
-                effects=Effects().without("multipath", "smear"),
-                every=EVERY,
-                first=self.first,
-                frames=self.frames,
-            )
+            part = {"every": EVERY, "first": self.first, "frames": self.frames}
+            if self.camera == PHONE:
+                made = plan_phone(self.scene, **part)
+                made = replace(made, motion=self._moved(made.motion))
+                return made, made.motion.T_room_camera(made.times[0]) @ made.poses
+            effects = Effects().without("multipath", "smear")
+            made = plan(self.scene, camera=self.camera, effects=effects, **part)
+        made = replace(made, sequence=self._moved(made.sequence))
+        start = made.raw[0] / made.sequence.frame_rate_hz
+        return made, made.sequence.T_room_camera(start) @ made.poses
+
+    def _moved(self, motion: Motion) -> Motion:
+        """The motion on the path of this tour."""
         if not self.parallel:
-            return made
-        path = made.sequence.camera_path
-        return replace(
-            made, sequence=replace(made.sequence, camera_path=lambda t: path(t) @ BESIDE)
-        )
+            return motion
+        path = motion.camera_path
+        return replace(motion, camera_path=lambda t: path(t) @ BESIDE)
 
     def recording(self) -> tuple[Path, Float64]:
         """Folder of the recording, and (N, 4, 4) true T_flat_camera."""
-        made, folder = self.plan(), OUT / self.name
-        made_once(folder, partial(write, made))
-        start = made.raw[0] / made.sequence.frame_rate_hz
-        return folder, made.sequence.T_room_camera(start) @ made.poses
+        (made, poses), folder = self.plan(), OUT / self.name
+        made_once(folder, partial(write_phone if isinstance(made, PhonePlan) else write, made))
+        return folder, poses
 
     def result(self, threads: int) -> Path:
         """Folder of the result."""
@@ -145,6 +150,7 @@ CASES = (
     Case("shares a room", FIRST, SECOND, True),
     Case("chair moved by 10 cm", FIRST, replace(SECOND, name="b-moved", chair=0.1), True),
     Case("another camera", FIRST, replace(SECOND, name="b-sr4000", camera="sr4000"), True),
+    Case("a phone", FIRST, replace(SECOND, name="b-phone", camera=PHONE), True),
     Case("shares a doorway", FIRST, Tour("doorway", 400, 60), True),
     Case("other rooms", FIRST, Tour("c", 570, 60), False),
     Case(
