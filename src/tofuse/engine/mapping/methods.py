@@ -87,11 +87,9 @@ def methods() -> dict[str, Callable[[ViewKind], Config]]:
     return {"default": default, "thesis": thesis}
 
 
-def from_method(name: str, kind: ViewKind = "range") -> Config:
+def from_method(name: str, kind: ViewKind = "range", *, where: str = "config") -> Config:
     """Return the configuration of that name for a kind of view; InputError if there is none."""
     available = methods()
     if not isinstance(name, str) or name not in available:
-        raise InputError(
-            f"is {name!r}", where="--method", remedy=f"use one of {', '.join(available)}"
-        )
+        raise InputError(f"is {name!r}", where=where, remedy=f"use one of {', '.join(available)}")
     return available[name](kind)
