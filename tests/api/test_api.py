@@ -227,6 +227,8 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
     assert recording.timestamps[-1] == 7.5
     assert (recording[0].depth[:3] == 0).all()
     assert (recording[0].depth[:, 79] == 0).all()
+    some = tofuse.from_arrays(depth, K, color=[color[0], *[None] * 5])
+    assert [frame.color_image is None for frame in some] == [False, *[True] * 5]
 
 
 @pytest.mark.parametrize(
@@ -247,6 +249,9 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
         ({"amplitude": np.ones((6, 30, 40))}, "amplitude"),
         ({"timestamps": [0, 1, 1, 2, 3, 4]}, "timestamps: are not numbers that ascend: that of im"),
         ({"timestamps": [0, 1, 2, np.nan, 4, 5]}, "that of image 3 is nan"),
+        ({"depth": [np.ones((60, 80)), None]}, "image 1 is None; leave out such frames"),
+        ({"color": [None] * 5}, "contains 5 images, and depth 6"),
+        ({"camera": {"fx": 70}}, "is a dict, neither a camera nor a matrix"),
         ({"timestamps": 30}, "timestamps: have shape (), and depth 6 images"),
         ({"reference": np.eye(4)}, "reference"),
         ({"reference": 2 * np.tile(np.eye(4), (6, 1, 1))}, "reference[0]"),
@@ -324,6 +329,15 @@ def test_unusable_frames_are_rejected(arrays, change, named):
         tofuse.RangeFrame(**given)
 
 
+def test_masked_pixels_have_no_value(arrays) -> None:
+    depth = np.ma.masked_array(arrays[0][0], np.arange(80) % 2 == np.zeros((60, 1)))
+    camera = tofuse.Pinhole(80, 60, 70, 70, 39.5, 29.5)
+    frame = tofuse.RangeFrame(0, 0.0, camera, depth, amplitude_image=depth)
+    assert frame.valid[:, 1::2].all()
+    assert not frame.valid[:, ::2].any()
+    assert not frame.amplitude_image[:, ::2].any()
+
+
 def test_negative_amplitude_is_none(arrays) -> None:
     amplitude = np.full(arrays[0].shape, 100.0)
     amplitude[:, :30] = -5
@@ -340,6 +354,11 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
     for call, named in (
         (lambda: tofuse.open(None), "path: is a NoneType"),
         (lambda: tofuse.open([tmp_path]), "path: is a list"),
+        (lambda: tofuse.open(tmp_path, camera=np.eye(3)), r"pass the path of a camera\.json"),
+        (lambda: tofuse.reconstruct(recording, progress="bar"), "progress: is 'bar'"),
+        (lambda: tofuse.reconstruct(recording, "fast"), "^config: is 'fast'"),
+        (lambda: tofuse.reconstruct(recording, prior="arkit"), "^prior: is 'arkit'"),
+        (lambda: tofuse.Mapper(threads=0), "threads: is 0"),
         (lambda: tofuse.load(None), "folder: "),
         (lambda: result.save(None), "folder: "),
         (lambda: result.mesh.save(None), r"path: is a NoneType.*ends in one of \.glb"),

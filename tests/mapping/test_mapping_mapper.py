@@ -65,6 +65,24 @@ def test_frames_pushed_one_by_one_give_same_bytes(frames, whole) -> None:
     assert result.recording == {"path": None, "format": "frames", "frames": 8}
 
 
+def test_camera_may_reuse_its_arrays(frames) -> None:
+    """As drivers do: the next image is written into the same memory."""
+    colors = [np.full((*frame.depth.shape, 3), 20 * k, np.uint8) for k, frame in enumerate(frames)]
+    buffers = np.empty_like(frames[0].depth), np.empty_like(colors[0])
+    kept, reused = Mapper(CONFIG), Mapper(CONFIG)
+    for frame, color in zip(frames[:3], colors, strict=False):
+        kept.push(replace(frame, color_image=color))
+        buffers[0][:], buffers[1][:] = frame.depth, color
+        reused.push(replace(frame, depth=buffers[0], color_image=buffers[1]))
+        assert reused.last is not None
+        assert reused.last.status == "tracked"
+    for buffer in buffers:
+        buffer[:] = 0
+    kept_cloud, reused_cloud = kept.finish().cloud, reused.finish().cloud
+    np.testing.assert_array_equal(kept_cloud.points, reused_cloud.points)
+    np.testing.assert_array_equal(kept_cloud.color, reused_cloud.color)
+
+
 def test_result_of_whole_run(whole, recording) -> None:
     assert whole.trajectory.shape == (8, 4, 4)
     np.testing.assert_array_equal(whole.trajectory[0], np.eye(4))

@@ -49,7 +49,7 @@ from tofuse.engine.mapping import (
 )
 from tofuse.engine.mapping import Mapper as OnlineMapper
 from tofuse.engine.parts import name_of
-from tofuse.engine.progress import Progress, Silent
+from tofuse.engine.progress import Progress, Silent, receiver
 from tofuse.engine.results import Reconstruction, accuracy_card
 from tofuse.formats.rigs import check_one_camera
 
@@ -168,7 +168,7 @@ class Result(Reconstruction):
         if poses is None:
             raise InputError(
                 "has no reference poses",
-                where="the recording" if self.source else "the loaded result",
+                where="the recording" if self.source else "the result",
                 remedy="pass a reference",
             )
         return evaluate(
@@ -430,8 +430,8 @@ def merge(
     return Result.of(merged)
 
 
-def _with_terminal(progress: Progress | bool | None) -> AbstractContextManager[Progress | None]:
-    return TerminalProgress(sys.stderr) if progress is True else nullcontext(progress or None)
+def _with_terminal(progress: Progress | bool | None) -> AbstractContextManager[Progress]:
+    return TerminalProgress(sys.stderr) if progress is True else nullcontext(receiver(progress))
 
 
 def load(folder: str | Path, *, edited: bool = False) -> Result:

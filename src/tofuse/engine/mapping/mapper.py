@@ -27,7 +27,7 @@ from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.preparation import FilteredFrame, Preparation, Prepared
 from tofuse.engine.parts import check_number
-from tofuse.engine.progress import OnlineMap, Progress, Silent
+from tofuse.engine.progress import OnlineMap, Progress, receiver
 from tofuse.engine.results import FrameRecord, Reconstruction
 from tofuse.engine.stopwatch import current, timing
 from tofuse.engine.stored_views import PosedView
@@ -79,6 +79,8 @@ class Mapper:
         colors: ColorFrames | None = None,
     ) -> None:
         check_number(seed, Bounds(0), "seed", whole=True)
+        if threads is not None:
+            check_number(threads, Bounds(1), "threads", whole=True)
         self.config = from_method(config) if isinstance(config, str) else checked(config)
         self._method = config if isinstance(config, str) else None
         self.seed = seed
@@ -87,10 +89,7 @@ class Mapper:
             ahead.load_in_background()
         self.watch = current()
         self._prior_loops, self._surface = prior_loops(loops), surface
-        if progress and not hasattr(progress, "began"):
-            remedy = "pass an object that receives it; `reconstruct` shows it on the terminal"
-            raise InputError(f"is {progress!r}", where="progress", remedy=remedy)
-        self._progress = progress or Silent()
+        self._progress = receiver(progress)
         self._sequence = FrameSequence()
         self._log = FrameLog()
         self._finished = False
@@ -123,7 +122,8 @@ class Mapper:
         Parameters
         ----------
         frame
-            Uncorrected and unfiltered. Its `index` must be larger than those before.
+            Uncorrected and unfiltered. Its `index` must be larger than those before. Without
+            `history` it is copied: a camera may write the next image into the same arrays.
         T_odometry
             (4, 4) T_world_camera from odometry or a phone, in any fixed world frame; None or NaN
             where there is none. It is a prior if the configuration has the part "odometry", or is
@@ -153,6 +153,8 @@ class Mapper:
         """
         T_given, down = _odometry(T_odometry), _direction(gravity)
         frame, T_given = self._check(frame, T_given)
+        if history is None:
+            frame = frame.copy()
         repeated = self._sequence.is_repeated(frame)
         if repeated:
             self._log.repeated.append(frame.index)
@@ -240,6 +242,7 @@ class Mapper:
             Provides corrections, filters and odometry of the new recording; None keeps the current
             ones. Its component numbers must not have been used before.
         """
+        self._check_open()
         if self._log.entries:
             self._log.interruptions.append(len(self._log.entries))
         self._tracker.interrupt()

@@ -105,6 +105,9 @@ def open_recording(
         reading.path_of(path, "path", "pass a path, or several: tofuse.open(a, b)")
     if not paths:
         raise InputError("no recording was given", remedy="pass a path")
+    for name, file in (("camera", camera), ("rig", rig)):
+        if file is not None:
+            reading.path_of(file, name, f"pass the path of a {name}.json")
     _check_depths(min_depth, max_depth)
     inner = [unzipped(path) for path in paths]
     options = ReaderOptions(None if camera is None else Path(camera), topic)
