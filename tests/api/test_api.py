@@ -378,7 +378,7 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: tofuse.reconstruct(recording, seed=-1), "seed: is -1"),
         (lambda: tofuse.register(recording[0], recording[1], seed=1.5), "seed: is 1.5"),
         (lambda: tofuse.Mapper().push(arrays[0][0]), "frame: is a ndarray"),
-        (lambda: tofuse.Mapper({}), "config: is a dict"),
+        (lambda: tofuse.Mapper([]), "config: is a list"),
         (lambda: tofuse.Mapper(progress=True), "progress: is True"),
         (lambda: tofuse.reconstruct(recording, None), "config: is a NoneType"),
         (lambda: tofuse.reconstruct(recording, {"method": []}), r"is \[\]; use one of"),

@@ -120,7 +120,12 @@ def test_order_kind_and_end_are_checked(frames) -> None:
         mapper.push(cloud)
     mapper.push(frames[4])
     assert mapper.finish().has_pose.tolist() == [True, True]
-    for call in (lambda: mapper.push(frames[5]), mapper.finish, lambda: mapper.skip(6, 0.0, "")):
+    for call in (
+        lambda: mapper.push(frames[5]),
+        lambda: mapper.skip(6, 0.0, ""),
+        mapper.finish,
+        mapper.interrupt,
+    ):
         with pytest.raises(InputError, match="mapper: is finished; make a new Mapper"):
             call()
 
@@ -148,6 +153,19 @@ def test_wrong_sensor_data_is_refused_and_costs_no_map(frames, sensor, problem) 
     assert mapper.log.entries[1].T_odometry is None
     assert mapper.log.entries[1].gravity is None
     assert mapper.finish().has_pose.all()
+
+
+def test_options_configure_images_and_clouds(frames) -> None:
+    options = {"method": "thesis", "fusion": {"voxel_m": 0.07}}
+    assert Mapper(options).config == changed(
+        from_method("thesis"), {"fusion": {"voxel_m": 0.07}}, where=""
+    )
+    mapper = Mapper({"fusion": {"voxel_m": 0.07}})
+    mapper.push(CloudFrame.of(frames[0].points[::20]))
+    assert mapper.config.odometry == from_method("default", "cloud").odometry
+    assert mapper.config.fusion.voxel_m == 0.07
+    with pytest.raises(InputError, match="config: fusion: unknown option 'voxel'"):
+        Mapper({"fusion": {"voxel": 0.07}})
 
 
 def test_loops_are_given_as_pairs() -> None:

@@ -42,9 +42,7 @@ from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping import (
     Config,
     adaptation,
-    changed,
-    checked,
-    from_method,
+    configured,
     reconstructing,
 )
 from tofuse.engine.mapping import Mapper as OnlineMapper
@@ -134,7 +132,7 @@ class Result(Reconstruction):
 
         if self.source is not None:
             config = self.fitted or adaptation.adapted(
-                _configuration(self.config, self.source), self.source
+                configured(self.config, reconstructing.view_kind(self.source)), self.source
             )
             write_report_files(self.source, config, result, folder)
             return
@@ -295,7 +293,7 @@ class Mapper(OnlineMapper):
     Parameters
     ----------
     config
-        A configuration, or the name of one.
+        A configuration, or the name of one; or options, as for `reconstruct`.
     seed
         The result is reproducible for each seed.
     threads
@@ -369,7 +367,7 @@ def reconstruct(
         )
     check_one_camera(recording)
     with _with_terminal(progress) as display:
-        chosen = _configuration(config, recording)
+        chosen = configured(config, reconstructing.view_kind(recording))
         # No sensor measures the motion relative to a moving object.
         filters = {name_of(part) for part in chosen.filters}
         if not filters & {"background", "foreground"}:
@@ -381,16 +379,6 @@ def reconstruct(
             recording, fitted, seed=seed, threads=threads, loops=loops, progress=display
         )
     return Result.of(with_findings(reconstruction, findings, turning=turning), recording, fitted)
-
-
-def _configuration(config: Config | str | Mapping[str, Any], recording: Recording) -> Config:
-    kind = reconstructing.view_kind(recording)
-    if isinstance(config, str):
-        return from_method(config, kind)
-    if isinstance(config, Mapping):
-        options = {name: value for name, value in config.items() if name != "method"}
-        return changed(from_method(config.get("method", "default"), kind), options, where="config")
-    return checked(config)
 
 
 def merge(

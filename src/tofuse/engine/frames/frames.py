@@ -405,6 +405,7 @@ def _copies(frame: Frame, names: Sequence[str]) -> dict[str, Any]:
     arrays = {name: getattr(frame, name) for name in names}
     return {name: np.array(array) for name, array in arrays.items() if array is not None}
 
+
 # The resolution of float32 is coarser than half a millimetre beyond.
 _MAP_COORDINATES_M = 8192.0
 _MAX_SAMPLED = 100_000  # points
