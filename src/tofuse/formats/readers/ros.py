@@ -195,7 +195,7 @@ class RosSource(bags.BagSource):
         return bags.frame_name(track.message(0).header.frame_id)
 
     def _read_poses(self, transforms: bags.Transforms) -> None:
-        """Read the poses of the depth camera from tf."""
+        """Read the poses of the depth camera from tf, and from messages of odometry."""
         if not transforms:
             return
         try:
@@ -207,15 +207,18 @@ class RosSource(bags.BagSource):
         ancestors = transforms.ancestors(frame)
         if transforms.any_moves and not transforms.moves(ancestors[-1], frame):
             self.warnings.append(
-                f"tf has frames that move, but the frame of depth, {frame!r}, is attached to none "
-                "of them: if it should be, /tf_static was not recorded"
+                f"tf or odometry has frames that move, but the frame of depth, {frame!r}, is "
+                "attached to none of them: if it should be, /tf_static was not recorded"
             )
             return
-        odometry = next((name for name in ancestors if _ODOMETRY in name.lower()), None)
+        topics = transforms.odometry_topics
+        odometry = next((n for n in ancestors if n in topics or _ODOMETRY in n.lower()), None)
         if odometry is not None and transforms.moves(odometry, frame):
             poses = transforms.poses(odometry, frame, self.timestamps)
             if np.isfinite(poses).any():
                 self.odometry = poses
+                if odometry in topics:
+                    self.metadata["odometry_topic"] = topics[odometry]
         if ancestors[-1] != odometry and transforms.moves(ancestors[-1], frame):
             poses = transforms.poses(ancestors[-1], frame, self.timestamps)
             if np.isfinite(poses).any():
