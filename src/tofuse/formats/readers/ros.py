@@ -10,14 +10,23 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.engine.arrays import Float32, UInt8
+from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
-from tofuse.formats.sources import Reader, ReaderOptions, Sniff, bags, cloud_files, organised
+from tofuse.formats.sources import (
+    ACCELERATION,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    bags,
+    cloud_files,
+    gravity_at,
+    organised,
+)
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
@@ -52,10 +61,13 @@ class RosSource(bags.BagSource):
     ----------
     raster
         The camera of clouds that are images of one; else None.
+    imu
+        Columns of the native imu.csv, in the axes of the depth camera; or None.
     """
 
     unit = 0.001  # integer depth is in mm by convention (REP 118)
     raster: Camera | None = None
+    imu: dict[str, Float64] | None = None
 
     def find_streams(self, options: ReaderOptions) -> None:
         """See `BagSource.find_streams`."""
@@ -80,6 +92,7 @@ class RosSource(bags.BagSource):
                 )
             self.raster = self._organised()
         self._read_poses(transforms)
+        self._read_gravity(transforms)
         self.metadata |= {"topic": self.connection.topic}
         others = sorted({c.topic for c in self._candidates()} - {self.connection.topic})
         if others and options.topic is None:
@@ -223,6 +236,33 @@ class RosSource(bags.BagSource):
             poses = transforms.poses(ancestors[-1], frame, self.timestamps)
             if np.isfinite(poses).any():
                 self.reference = poses
+
+    def _read_gravity(self, transforms: bags.Transforms) -> None:
+        """Read the direction of gravity from an accelerometer that is fixed to the camera."""
+        topics = sorted({c.topic for c in self.bag.connections if c.msgtype == bags.IMU_TYPE})
+        try:
+            with reading.library_errors(self.path, bags.REMEDY):
+                camera = self._frame_of(self.depth) if topics else ""
+                found = {topic: bags.accelerations(self.bag, topic) for topic in topics}
+        except InputError as error:
+            self.warnings.append(f"accelerations are ignored: {error}")
+            return
+        measured = {topic: value for topic, value in found.items() if value is not None}
+        for topic, (frame, columns) in measured.items():
+            T = transforms.static_transform(camera, frame)
+            if T is None:
+                continue
+            turned = T[:3, :3] @ np.array([columns[name] for name in ACCELERATION])
+            self.imu = columns | dict(zip(ACCELERATION, turned, strict=True))
+            self.gravity = gravity_at(self.timestamps, self.imu)
+            self.metadata["imu_topic"] = topic
+            return
+        if measured:
+            topic, (frame, _) = next(iter(measured.items()))
+            self.warnings.append(
+                f"gravity in {topic} is ignored: the relation of its frame, {frame!r}, to that of "
+                f"depth, {camera!r}, is not in the bag (/tf_static)"
+            )
 
     def _find_color(self, transforms: bags.Transforms) -> None:
         """Find a colour camera with known intrinsics and pose relative to depth."""

@@ -27,6 +27,7 @@ from tofuse.formats.files import reading
 from tofuse.formats.geometry import unpacked_color
 from tofuse.formats.images import as_color, parse_image
 from tofuse.formats.sources.file_source import FileSource
+from tofuse.formats.sources.imu import ACCELERATION
 from tofuse.formats.sources.pixels import finite_float32, sampled_color
 from tofuse.formats.sources.reader import ReaderOptions
 
@@ -655,6 +656,32 @@ class Transforms:
 def frame_name(name: Any) -> str:
     """Return the name of a frame without the leading slash of early ROS 1."""
     return str(name).lstrip("/")
+
+
+IMU_TYPE = "sensor_msgs/msg/Imu"
+# Lengths of the acceleration at rest, m/s^2 or g; without gravity it is not as long.
+_AT_REST = ((9.81 / 1.2, 9.81 * 1.2), (1 / 1.2, 1.2))
+
+
+def accelerations(bag: Any, topic: str) -> tuple[str, dict[str, Float64]] | None:
+    """Return the frame of an accelerometer, and what it measures; None if that is not gravity.
+
+    Columns by name: `timestamp` (s), and `ax`, `ay`, `az` in its own axes.
+    """
+    connections = [c for c in bag.connections if (c.topic, c.msgtype) == (topic, IMU_TYPE)]
+    frame, rows = "", []
+    for _, _, raw in bag.messages(connections=connections):
+        message = bag.deserialize(raw, IMU_TYPE)
+        if message.linear_acceleration_covariance[0] == -1:  # it has none
+            return None
+        a, stamp = message.linear_acceleration, message.header.stamp
+        frame = frame_name(message.header.frame_id)
+        rows.append((stamp.sec + stamp.nanosec / 1e9, a.x, a.y, a.z))
+    columns = np.array(rows, float).reshape(-1, 4)
+    length = np.median(np.linalg.norm(columns[:, 1:], axis=1)) if rows else 0.0
+    if not any(low < length < high for low, high in _AT_REST):
+        return None
+    return frame, dict(zip(("timestamp", *ACCELERATION), columns.T, strict=True))
 
 
 def _messages(bag: Any, *kinds: str) -> Iterator[tuple[str, Any]]:
