@@ -159,6 +159,11 @@ def test_evaluate_accepts_files_and_arrays(result, arrays, tmp_path):
         loaded.evaluate(poses[:5])
     with pytest.raises(tofuse.InputError, match="no reference"):
         loaded.evaluate()
+    recording = tofuse.from_arrays(*arrays[:2], reference=poses)
+    assert loaded.evaluate(recording).error.ate_rms_m == pytest.approx(by_array)
+    assert tofuse.evaluate(loaded, recording).error.ate_rms_m == pytest.approx(by_array)
+    with pytest.raises(tofuse.InputError, match="reference: has no reference poses"):
+        loaded.evaluate(tofuse.from_arrays(*arrays[:2]))
 
 
 def test_mapper_states_each_pose_and_its_result_is_saved(arrays, tmp_path):
@@ -359,6 +364,7 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: tofuse.reconstruct(recording, "fast"), "^config: is 'fast'"),
         (lambda: tofuse.reconstruct(recording, prior="arkit"), "^prior: is 'arkit'"),
         (lambda: tofuse.Mapper(threads=0), "threads: is 0"),
+        (lambda: tofuse.open(tmp_path, min_depth="1m"), "min-depth: is '1m'"),
         (lambda: tofuse.load(None), "folder: "),
         (lambda: result.save(None), "folder: "),
         (lambda: result.mesh.save(None), r"path: is a NoneType.*ends in one of \.glb"),

@@ -141,7 +141,7 @@ class Result(Reconstruction):
 
     def evaluate(
         self,
-        reference: str | Path | ArrayLike | None = None,
+        reference: str | Path | Recording | ArrayLike | None = None,
         *,
         reference_error_m: float | None = None,
     ) -> Evaluation:
@@ -150,8 +150,8 @@ class Result(Reconstruction):
         Parameters
         ----------
         reference
-            A file, or (N, 4, 4) T_world_camera of the same frames, NaN where there is none. None:
-            the reference poses of the recording.
+            A file, a recording with reference poses, or (N, 4, 4) T_world_camera of the same
+            frames, NaN where there is none. None: the reference poses of the result's recording.
         reference_error_m
             Rms error of the reference itself, m.
 
@@ -171,7 +171,9 @@ class Result(Reconstruction):
             )
         return evaluate(
             self,
-            poses if isinstance(poses, str | Path) else se3.check_poses(poses, where="reference"),
+            poses
+            if isinstance(poses, str | Path | Recording)
+            else se3.check_poses(poses, where="reference"),
             recording=self.source,
             reference_error_m=reference_error_m,
             config=self.config,
