@@ -364,6 +364,7 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: tofuse.reconstruct(recording, "fast"), "^config: is 'fast'"),
         (lambda: tofuse.reconstruct(recording, prior="arkit"), "^prior: is 'arkit'"),
         (lambda: tofuse.Mapper(threads=0), "threads: is 0"),
+        (lambda: tofuse.advise(None), "source: is a NoneType"),
         (lambda: tofuse.open(tmp_path, min_depth="1m"), "min-depth: is '1m'"),
         (lambda: tofuse.load(None), "folder: "),
         (lambda: result.save(None), "folder: "),
