@@ -198,10 +198,16 @@ class RosSource(bags.BagSource):
     def _transforms(self) -> bags.Transforms:
         try:
             with reading.library_errors(self.path, bags.REMEDY):
-                return bags.Transforms.read(self.bag)
+                transforms = bags.Transforms.read(self.bag)
         except InputError as error:
             self.warnings.append(f"tf is ignored: {error}")
-            return bags.Transforms({})
+            transforms = bags.Transforms({})
+        try:
+            with reading.library_errors(self.path, bags.REMEDY):
+                transforms.add_odometry(self.bag)
+        except InputError as error:
+            self.warnings.append(f"odometry is ignored: {error}")
+        return transforms
 
     def _frame_of(self, track: bags.Track) -> str:
         """Name of the tf frame of the messages."""
@@ -239,30 +245,32 @@ class RosSource(bags.BagSource):
 
     def _read_gravity(self, transforms: bags.Transforms) -> None:
         """Read the direction of gravity from an accelerometer that is fixed to the camera."""
-        topics = sorted({c.topic for c in self.bag.connections if c.msgtype == bags.IMU_TYPE})
-        try:
-            with reading.library_errors(self.path, bags.REMEDY):
-                camera = self._frame_of(self.depth) if topics else ""
-                found = {topic: bags.accelerations(self.bag, topic) for topic in topics}
-        except InputError as error:
-            self.warnings.append(f"accelerations are ignored: {error}")
-            return
-        measured = {topic: value for topic, value in found.items() if value is not None}
-        for topic, (frame, columns) in measured.items():
+        apart = None
+        for topic in sorted({c.topic for c in self.bag.connections if c.msgtype == bags.IMU_TYPE}):
+            try:
+                with reading.library_errors(self.path, bags.REMEDY):
+                    camera = self._frame_of(self.depth)
+                    measured = bags.accelerations(self.bag, topic)
+            except InputError as error:
+                self.warnings.append(f"{topic} is ignored: {error}")
+                continue
+            if measured is None:
+                continue
+            frame, columns = measured
             T = transforms.static_transform(camera, frame)
             if T is None:
+                apart = apart or (
+                    f"gravity in {topic} is ignored: the relation of its frame, {frame!r}, to that "
+                    f"of depth, {camera!r}, is not in the bag (/tf_static)"
+                )
                 continue
             turned = T[:3, :3] @ np.array([columns[name] for name in ACCELERATION])
             self.imu = columns | dict(zip(ACCELERATION, turned, strict=True))
             self.gravity = gravity_at(self.timestamps, self.imu)
             self.metadata["imu_topic"] = topic
             return
-        if measured:
-            topic, (frame, _) = next(iter(measured.items()))
-            self.warnings.append(
-                f"gravity in {topic} is ignored: the relation of its frame, {frame!r}, to that of "
-                f"depth, {camera!r}, is not in the bag (/tf_static)"
-            )
+        if apart is not None:
+            self.warnings.append(apart)
 
     def _find_color(self, transforms: bags.Transforms) -> None:
         """Find a colour camera with known intrinsics and pose relative to depth."""

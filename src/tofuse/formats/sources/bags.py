@@ -582,11 +582,9 @@ class Transforms:
                 rows.setdefault(child, []).append(row)
                 if _STATIC in topic:
                     static.add(child)
-        transforms = cls({child: _edge(found, child in static) for child, found in rows.items()})
-        transforms._add_odometry(bag)
-        return transforms
+        return cls({child: _edge(found, child in static) for child, found in rows.items()})
 
-    def _add_odometry(self, bag: Any) -> None:
+    def add_odometry(self, bag: Any) -> None:
         """Add the poses of messages of odometry, where tf does not state the motion itself."""
         rows: dict[tuple[str, str], list[_Row]] = {}
         for topic, message in _messages(bag, _ODOMETRY_TYPE):
