@@ -159,6 +159,11 @@ def test_evaluate_accepts_files_and_arrays(result, arrays, tmp_path):
         loaded.evaluate(poses[:5])
     with pytest.raises(tofuse.InputError, match="no reference"):
         loaded.evaluate()
+    recording = tofuse.from_arrays(*arrays[:2], reference=poses)
+    assert loaded.evaluate(recording).error.ate_rms_m == pytest.approx(by_array)
+    assert tofuse.evaluate(loaded, recording).error.ate_rms_m == pytest.approx(by_array)
+    with pytest.raises(tofuse.InputError, match="reference: has no reference poses"):
+        loaded.evaluate(tofuse.from_arrays(*arrays[:2]))
 
 
 def test_mapper_states_each_pose_and_its_result_is_saved(arrays, tmp_path):
@@ -227,6 +232,8 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
     assert recording.timestamps[-1] == 7.5
     assert (recording[0].depth[:3] == 0).all()
     assert (recording[0].depth[:, 79] == 0).all()
+    some = tofuse.from_arrays(depth, K, color=[color[0], *[None] * 5])
+    assert [frame.color_image is None for frame in some] == [False, *[True] * 5]
 
 
 @pytest.mark.parametrize(
@@ -247,6 +254,9 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
         ({"amplitude": np.ones((6, 30, 40))}, "amplitude"),
         ({"timestamps": [0, 1, 1, 2, 3, 4]}, "timestamps: are not numbers that ascend: that of im"),
         ({"timestamps": [0, 1, 2, np.nan, 4, 5]}, "that of image 3 is nan"),
+        ({"depth": [np.ones((60, 80)), None]}, "image 1 is None; leave out such frames"),
+        ({"color": [None] * 5}, "contains 5 images, and depth 6"),
+        ({"camera": {"fx": 70}}, "is a dict, neither a camera nor a matrix"),
         ({"timestamps": 30}, "timestamps: have shape (), and depth 6 images"),
         ({"reference": np.eye(4)}, "reference"),
         ({"reference": 2 * np.tile(np.eye(4), (6, 1, 1))}, "reference[0]"),
@@ -324,6 +334,15 @@ def test_unusable_frames_are_rejected(arrays, change, named):
         tofuse.RangeFrame(**given)
 
 
+def test_masked_pixels_have_no_value(arrays) -> None:
+    depth = np.ma.masked_array(arrays[0][0], np.arange(80) % 2 == np.zeros((60, 1)))
+    camera = tofuse.Pinhole(80, 60, 70, 70, 39.5, 29.5)
+    frame = tofuse.RangeFrame(0, 0.0, camera, depth, amplitude_image=depth)
+    assert frame.valid[:, 1::2].all()
+    assert not frame.valid[:, ::2].any()
+    assert not frame.amplitude_image[:, ::2].any()
+
+
 def test_negative_amplitude_is_none(arrays) -> None:
     amplitude = np.full(arrays[0].shape, 100.0)
     amplitude[:, :30] = -5
@@ -340,6 +359,13 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
     for call, named in (
         (lambda: tofuse.open(None), "path: is a NoneType"),
         (lambda: tofuse.open([tmp_path]), "path: is a list"),
+        (lambda: tofuse.open(tmp_path, camera=np.eye(3)), r"pass the path of a camera\.json"),
+        (lambda: tofuse.reconstruct(recording, progress="bar"), "progress: is 'bar'"),
+        (lambda: tofuse.reconstruct(recording, "fast"), "^config: is 'fast'"),
+        (lambda: tofuse.reconstruct(recording, prior="arkit"), "^prior: is 'arkit'"),
+        (lambda: tofuse.Mapper(threads=0), "threads: is 0"),
+        (lambda: tofuse.advise(None), "source: is a NoneType"),
+        (lambda: tofuse.open(tmp_path, min_depth="1m"), "min-depth: is '1m'"),
         (lambda: tofuse.load(None), "folder: "),
         (lambda: result.save(None), "folder: "),
         (lambda: result.mesh.save(None), r"path: is a NoneType.*ends in one of \.glb"),
@@ -359,7 +385,7 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: tofuse.reconstruct(recording, seed=-1), "seed: is -1"),
         (lambda: tofuse.register(recording[0], recording[1], seed=1.5), "seed: is 1.5"),
         (lambda: tofuse.Mapper().push(arrays[0][0]), "frame: is a ndarray"),
-        (lambda: tofuse.Mapper({}), "config: is a dict"),
+        (lambda: tofuse.Mapper([]), "config: is a list"),
         (lambda: tofuse.Mapper(progress=True), "progress: is True"),
         (lambda: tofuse.reconstruct(recording, None), "config: is a NoneType"),
         (lambda: tofuse.reconstruct(recording, {"method": []}), r"is \[\]; use one of"),

@@ -222,6 +222,29 @@ def test_signal_in_destructor_is_not_lost(name: str, status: int) -> None:
     assert done.stderr.count(b"\n") == 1
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+def test_interrupted_command_ends_though_a_thread_does_not() -> None:
+    """One that waits for a lock of a library that the signal interrupted."""
+    script = (
+        "import os, signal, sys, threading, time\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from tofuse.apps.cli import program as cli\n"
+        "cli._GRACE_S = 0.1\n"
+        "lock = threading.Lock()\n"
+        "lock.acquire()\n"
+        "def command():\n"
+        "    threading.Thread(target=lock.acquire).start()\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    time.sleep(5)\n"
+        "cli.main = lambda: cli.run_command(command)\n"
+        "sys.exit(cli.console())\n"
+    )
+    words = [sys.executable, "-c", script]
+    done = subprocess.run(words, capture_output=True, check=False, timeout=20)
+    assert done.returncode == 130
+    assert done.stderr.count(b"\n") == 1
+
+
 CGROUPS = {
     "none": ({}, None),
     "all": ({"proc/self/cgroup": "0::/a\n", "sys/fs/cgroup/a/cpu.max": "max 100000\n"}, None),

@@ -168,6 +168,7 @@ USAGE = [
     (RUN + "--maxdepth 3", "--maxdepth|did you mean --max-depth?", "tofuse run: "),
     ("demo room", "room", "tofuse demo: "),
     (RUN + "--method magic", "--method|'magic'; use one of default, thesis", "tofuse: "),
+    (RUN + "--moving ignore --method thesis", "--moving: does not apply|'sequential'", "tofuse: "),
     (RUN + "--format magic", "--format|'magic'|native", "tofuse: "),
     (RUN + "--format tum", "REC", "tofuse: "),
     (RUN + "--start 9", "REC|selection leaves none|--start", "tofuse: "),
@@ -222,11 +223,14 @@ CONFIGS: dict[str, tuple[str, tuple[str, ...]]] = {
     "not text": ("\xff\xff", ("is not text",)),
     "unknown nested option": (
         "[odometry.registration]\nresolutoin = 1",
-        ("odometry.registration", "'resolutoin'", "'resolution'"),
+        ("odometry.registration", "'resolutoin'", " resolution,"),
     ),
-    "unknown part": ("[[filters]]\npart = 'magic'", ("filters[0]", "'magic'", "'median'")),
-    "number for a part": ("odometry = 3", ("odometry", "is 3", "'sequential'")),
-    "unknown method": ("method = 'magic'", ("'magic'", "default, thesis")),
+    "unknown part": ("[[filters]]\npart = 'magic'", ("filters[0]", "'magic'", " median,")),
+    "no part": ("[[filters]]\nsize = 3", ("filters[0]: names no part; set part to one of ",)),
+    "length with a unit": ("[fusion]\nvoxel_m = '1cm'", ("voxel_m: is '1cm'; use a number",)),
+    "word for a switch": ("self_calibration = 'no'", ("is 'no'; use true or false",)),
+    "number for a part": ("odometry = 3", ("odometry", "is 3", " sequential")),
+    "unknown method": ("method = 'magic'", ("my.toml: method", "'magic'", "default, thesis")),
 }
 
 

@@ -53,6 +53,13 @@ def test_words_become_options(words: str, changed: dict[str, Any]) -> None:
     assert options_of(*words.split()) == Options(out=Path("out"), **changed)
 
 
+def test_home_folder_after_an_equals_sign(monkeypatch) -> None:
+    """Shells expand `--out ~/result`, and leave `--out=~/result`."""
+    monkeypatch.setenv("HOME", str(Path("/home/me")))
+    monkeypatch.setenv("USERPROFILE", str(Path("/home/me")))
+    assert options_of("--config=~/my.toml").config == Path("/home/me/my.toml")
+
+
 def test_options_become_configuration() -> None:
     assert config_of("--guess", "identity")["odometry"]["guess"] == "identity"
     assert config_of("--moving", "ignore")["odometry"]["moving"] == "ignore"

@@ -14,6 +14,7 @@ import pytest
 
 from posed_results import DISTANCE, NORMAL, POSED, POSES, made_result, plane
 from tofuse.apps.cli.program import main
+from tofuse.apps.export import exporting
 from tofuse.apps.export.exporting import export
 from tofuse.apps.export.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from tofuse.apps.results.folders import OutputFolder
@@ -251,15 +252,23 @@ def test_rerun_read_by_its_reader(result: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "package", "extra"), [("rerun", "rerun", "rerun"), ("mcap", "mcap.writer", "mcap")]
+    ("name", "package", "extra"),
+    [
+        ("rerun", "rerun", "'tofuse[rerun]'"),
+        ("mcap", "mcap.writer", "'tofuse[mcap]'"),
+        ("e57", "pye57", "'tofuse[scan]'"),
+        ("stl", "trimesh", "trimesh"),
+    ],
 )
-def test_missing_package(
+def test_missing_package_is_named_before_any_work(
     result: Path, name: str, package: str, extra: str, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    assert main(["export", str(result), name]) == 2
-    assert f"pip install 'tofuse[{extra}]'" in capsys.readouterr().err
-    assert not [p for p in result.iterdir() if "rrd" in p.name or "mcap" in p.name]
+    monkeypatch.setattr(exporting, "_Result", None)
+    assert main(["export", str(result), "pcd", name]) == 2
+    assert f"export {name}: needs the package {package}; pip install {extra}" in (
+        capsys.readouterr().err
+    )
 
 
 def test_command_writes_grids_that_belong_to_the_result(

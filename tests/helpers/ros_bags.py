@@ -85,6 +85,30 @@ class Bag:
         name = "tf2_msgs/msg/TFMessage"
         self.write(topic, name, time, self.make(name, [stamped]))
 
+    def imu(
+        self, topic: str, time: float, frame: str, acceleration: np.ndarray, known: float = 0.0
+    ) -> None:
+        zero, covariance = np.zeros(9), np.array([known, *np.zeros(8)])
+        vector = self.store.types["geometry_msgs/msg/Vector3"]
+        turn = self.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+        speed, pull = vector(0.0, 0.0, 0.0), vector(*map(float, acceleration))
+        values = (self.header(time, frame), turn, zero, speed, zero, pull, covariance)
+        self.write(topic, "sensor_msgs/msg/Imu", time, self.make("sensor_msgs/msg/Imu", *values))
+
+    def odometry(self, topic: str, time: float, parent: str, child: str, T: np.ndarray) -> None:
+        q, zero = quaternion.from_matrix(T[:3, :3]), np.zeros(36)
+        point = self.make("geometry_msgs/msg/Point", *map(float, T[:3, 3]))
+        turn = self.make("geometry_msgs/msg/Quaternion", *map(float, q))
+        still = self.make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+        pose = self.make("geometry_msgs/msg/Pose", point, turn)
+        speed = self.make("geometry_msgs/msg/Twist", still, still)
+        values = (
+            self.make("geometry_msgs/msg/PoseWithCovariance", pose, zero),
+            self.make("geometry_msgs/msg/TwistWithCovariance", speed, zero),
+        )
+        name = "nav_msgs/msg/Odometry"
+        self.write(topic, name, time, self.make(name, self.header(time, parent), child, *values))
+
     def write(self, topic: str, kind: str, time: float, message: Any) -> None:
         if topic not in self.connections:
             self.connections[topic] = self.writer.add_connection(topic, kind, typestore=self.store)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 from collections.abc import Callable
@@ -28,8 +29,9 @@ from tofuse.apps.cli.program import main
 from tofuse.apps.live.device import DeviceError, Stream, device_named, is_installed, known_devices
 from tofuse.apps.live.recorder import QUEUE_FRAMES, record
 from tofuse.engine.cameras.cameras import Pinhole, Rational
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import RangeFrame
+from tofuse.formats.files import atomic
 
 Install = Callable[..., None]
 
@@ -76,7 +78,7 @@ def test_realsense_errors_are_reported(install: Install) -> None:
     package.plugged_in = False
     with pytest.raises(DeviceError, match="no camera is connected"):
         device_named("realsense", {}).open()
-    with pytest.raises(DeviceError, match="no camera f999 is connected"):
+    with pytest.raises(DeviceError, match=r"no camera f999 is connected; .* --set serial="):
         device_named("realsense", {"serial": "f999"}).open()
 
 
@@ -175,6 +177,33 @@ def test_failing_camera_keeps_recorded_frames(install: Install, tmp_path: Path) 
     assert done.frames == 4
     assert "sent no frame" in done.ended_by
     assert len(tofuse.open(tmp_path / "a")) == 4
+
+
+@pytest.mark.parametrize("size", [800, 1000, 1250])
+def test_full_disk_keeps_recorded_frames(
+    size: int, install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The files at the end need space as well, for which the last frames make room."""
+    install(FakeRealSense(frames=5))
+
+    def limited(write: Callable[..., None]) -> Callable[..., None]:
+        def written(path: Path, content: Any) -> None:
+            used = sum(p.stat().st_size for p in tmp_path.rglob("*") if p.is_file())
+            if used + len(content) > size:
+                raise OutputError("can't be written (no space left on device)", where=path)
+            write(path, content)
+
+        return written
+
+    for name in ("write_bytes", "write_text"):
+        monkeypatch.setattr(atomic, name, limited(getattr(atomic, name)))
+    with device_named("realsense", {}).open() as stream:
+        done = record(stream, tmp_path / "a", seconds=60)
+    assert 0 < done.frames < 5
+    assert f"{tmp_path / 'a'}{os.sep}" in done.ended_by
+    assert "can't be written (no space left on device)" in done.ended_by
+    assert len(tofuse.open(tmp_path / "a")) == done.frames
+    assert len(list((tmp_path / "a").glob("*/*.png"))) == 2 * done.frames
 
 
 class Endless(Stream):

@@ -65,6 +65,24 @@ def test_frames_pushed_one_by_one_give_same_bytes(frames, whole) -> None:
     assert result.recording == {"path": None, "format": "frames", "frames": 8}
 
 
+def test_camera_may_reuse_its_arrays(frames) -> None:
+    """As drivers do: the next image is written into the same memory."""
+    colors = [np.full((*frame.depth.shape, 3), 20 * k, np.uint8) for k, frame in enumerate(frames)]
+    buffers = np.empty_like(frames[0].depth), np.empty_like(colors[0])
+    kept, reused = Mapper(CONFIG), Mapper(CONFIG)
+    for frame, color in zip(frames[:3], colors, strict=False):
+        kept.push(replace(frame, color_image=color))
+        buffers[0][:], buffers[1][:] = frame.depth, color
+        reused.push(replace(frame, depth=buffers[0], color_image=buffers[1]))
+        assert reused.last is not None
+        assert reused.last.status == "tracked"
+    for buffer in buffers:
+        buffer[:] = 0
+    kept_cloud, reused_cloud = kept.finish().cloud, reused.finish().cloud
+    np.testing.assert_array_equal(kept_cloud.points, reused_cloud.points)
+    np.testing.assert_array_equal(kept_cloud.color, reused_cloud.color)
+
+
 def test_result_of_whole_run(whole, recording) -> None:
     assert whole.trajectory.shape == (8, 4, 4)
     np.testing.assert_array_equal(whole.trajectory[0], np.eye(4))
@@ -102,7 +120,12 @@ def test_order_kind_and_end_are_checked(frames) -> None:
         mapper.push(cloud)
     mapper.push(frames[4])
     assert mapper.finish().has_pose.tolist() == [True, True]
-    for call in (lambda: mapper.push(frames[5]), mapper.finish, lambda: mapper.skip(6, 0.0, "")):
+    for call in (
+        lambda: mapper.push(frames[5]),
+        lambda: mapper.skip(6, 0.0, ""),
+        mapper.finish,
+        mapper.interrupt,
+    ):
         with pytest.raises(InputError, match="mapper: is finished; make a new Mapper"):
             call()
 
@@ -130,6 +153,19 @@ def test_wrong_sensor_data_is_refused_and_costs_no_map(frames, sensor, problem) 
     assert mapper.log.entries[1].T_odometry is None
     assert mapper.log.entries[1].gravity is None
     assert mapper.finish().has_pose.all()
+
+
+def test_options_configure_images_and_clouds(frames) -> None:
+    options = {"method": "thesis", "fusion": {"voxel_m": 0.07}}
+    assert Mapper(options).config == changed(
+        from_method("thesis"), {"fusion": {"voxel_m": 0.07}}, where=""
+    )
+    mapper = Mapper({"fusion": {"voxel_m": 0.07}})
+    mapper.push(CloudFrame.of(frames[0].points[::20]))
+    assert mapper.config.odometry == from_method("default", "cloud").odometry
+    assert mapper.config.fusion.voxel_m == 0.07
+    with pytest.raises(InputError, match="config: fusion: unknown option 'voxel'"):
+        Mapper({"fusion": {"voxel": 0.07}})
 
 
 def test_loops_are_given_as_pairs() -> None:

@@ -234,7 +234,7 @@ def test_color_of_other_camera_is_projected(tmp_path: Path) -> None:
     ("changes", "words"),
     [
         ({"schema": 2}, "schema is 2; write 1"),
-        ({"schema": None}, "schema is missing"),
+        ({"schema": None}, "no schema, and is no camera.json; .* by `tofuse calibrate import`"),
         ({"model": "hexagonal"}, "model: is 'hexagonal'; write one of pinhole"),
         ({"model": ["pinhole"]}, "model: is"),
         ({"model": "rays"}, "no rays.npy"),

@@ -574,6 +574,73 @@ def test_poses_from_tf(tmp_path: Path, kind: str) -> None:
     assert np.isnan(recording.odometry[2]).all()
 
 
+@pytest.mark.parametrize("kind", ["ros1", "ros2"])
+def test_poses_of_odometry_messages(tmp_path: Path, kind: str) -> None:
+    """Of a frame that tf attaches below the root of the camera's tree."""
+    bag = Bag(tmp_path, kind)
+    depth_bag(bag)
+    T_BASE_IMU = exp(np.array([0.3, 0.0, 0.1, 0.0, 0.0, 1.0]))
+    bag.tf("/tf_static", 9.0, "base", "depth", T_RIG_DEPTH)
+    bag.tf("/tf_static", 9.0, "base", "imu", T_BASE_IMU)
+    for k, T in enumerate(T_WORLD_RIG):
+        bag.odometry("/vio/state", 10 + 0.1 * k, "start", "imu", T @ T_BASE_IMU)
+        bag.odometry("/wheels", 10 + 0.1 * k, "other", "base", np.eye(4))
+    recording = open_recording(bag.close())
+    assert recording.reference is None
+    np.testing.assert_allclose(recording.odometry, T_WORLD_RIG @ T_RIG_DEPTH, atol=1e-6)
+    assert recording.metadata["odometry_topic"] == "/vio/state"
+
+
+def test_tf_precedes_odometry_messages(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "mcap")
+    depth_bag(bag)
+    bag.tf("/tf_static", 9.0, "base", "depth", T_RIG_DEPTH)
+    for k, T in enumerate(T_WORLD_RIG):
+        bag.tf("/tf", 10 + 0.1 * k, "odom", "base", T)
+        bag.odometry("/raw", 10 + 0.1 * k, "odom", "base", np.eye(4))
+    recording = open_recording(bag.close())
+    np.testing.assert_allclose(recording.odometry, T_WORLD_RIG @ T_RIG_DEPTH, atol=1e-6)
+    assert "odometry_topic" not in recording.metadata
+
+
+def test_odometry_of_a_frame_apart_from_depth_is_named(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros2")
+    depth_bag(bag)
+    for k, T in enumerate(T_WORLD_RIG):
+        bag.odometry("/odom", 10 + 0.1 * k, "odom", "base", T)
+    recording = open_recording(bag.close())
+    assert recording.odometry is None
+    assert any("odometry has frames that move" in line for line in recording.warnings)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_gravity_of_an_accelerometer(tmp_path: Path, kind: str) -> None:
+    """It measures g upwards at rest, in its own axes; a gyroscope measures none."""
+    bag = Bag(tmp_path, kind)
+    depth_bag(bag)
+    T_DEPTH_IMU = exp(np.array([0.3, 0.0, 0.1, 0.4, -1.2, 2.0]))
+    bag.tf("/tf_static", 9.0, "depth", "imu", T_DEPTH_IMU)
+    down = np.array([[0.0, 1.0, 0.0], [0.6, 0.8, 0.0], [0.0, 0.8, 0.6]])  # in each image
+    for k, direction in enumerate(down):
+        up = -9.81 * T_DEPTH_IMU[:3, :3].T @ direction
+        bag.imu("/a/gyro", 10 + 0.1 * k, "imu", np.zeros(3), known=-1.0)
+        bag.imu("/b/compensated", 10 + 0.1 * k, "imu", 0.02 * up)
+        bag.imu("/c/accel", 10 + 0.1 * k, "imu", up)
+    recording = open_recording(bag.close())
+    assert recording.gravity is not None
+    np.testing.assert_allclose(recording.gravity[:, :3], down, atol=1e-6)
+    assert recording.metadata["imu_topic"] == "/c/accel"
+
+
+def test_accelerometer_apart_from_depth_is_named(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros2")
+    depth_bag(bag)
+    bag.imu("/imu", 10.0, "elsewhere", np.array([0.0, 0.0, 9.8]))
+    recording = open_recording(bag.close())
+    assert recording.gravity is None
+    assert any("gravity in /imu is ignored: the relation" in line for line in recording.warnings)
+
+
 def test_tf_without_the_frame_of_depth(tmp_path: Path) -> None:
     """The latched /tf_static is missing: the robot moves, and nothing says where the camera is."""
     bag = Bag(tmp_path, "mcap")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import made_phones as made
+from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.formats.recordings.archives import unzipped
 from tofuse.formats.recordings.open import open_recording, open_view
@@ -89,6 +90,12 @@ def test_messages_name_the_archive(tmp_path: Path) -> None:
     (tmp_path / "stray" / "imu.csv").write_text("timestamp\n1\n")
     warnings = open_recording(zipped(tmp_path / "stray", tmp_path / "imu.zip")).warnings
     assert any(line.startswith(f"{tmp_path / 'imu.zip' / 'imu.csv'}: ") for line in warnings)
+
+
+def test_facts_name_the_archive(room_recording: Path, tmp_path: Path) -> None:
+    path = zipped(room_recording, tmp_path / "room.zip")
+    facts = inspect_recording(path, quick=True).facts
+    assert facts["truth"] == str(path / "truth")
 
 
 def test_unpacked_files_are_removed_with_the_process(tmp_path: Path) -> None:

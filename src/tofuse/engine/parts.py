@@ -20,7 +20,7 @@ import numbers
 import pkgutil
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
 from tofuse.engine.bounds import Bounds
@@ -30,6 +30,7 @@ T = TypeVar("T")
 Label = Literal["validated", "experimental"]
 
 _registry: dict[str, dict[str, type]] = {}
+_TYPES = {float: "a number", int: "a whole number", bool: "true or false", str: "a text in quotes"}
 
 
 def part(kind: str, name: str, *, label: Label = "experimental") -> Callable[[type[T]], type[T]]:
@@ -152,13 +153,13 @@ def from_dict(hint: Any, data: Any, *, where: str) -> Any:
         return _from_union(args, data, where)
     if origin is Literal:
         if data not in args:
-            raise InputError(f"is {data!r}", where=where, remedy=f"use one of {list(args)}")
+            raise InputError(f"is {data!r}", where=where, remedy=f"use one of {_listed(args)}")
         return data
     if origin in (tuple, list, Sequence):
         return _from_sequence(origin, args, data, where)
     if isinstance(hint, type) and getattr(hint, "part_kind", None):
         if not isinstance(data, Mapping):
-            remedy = f"write a table with a part, one of {list(registered(hint.part_kind))}"  # type: ignore[attr-defined]
+            remedy = f"write a table with a part, one of {_listed(registered(hint.part_kind))}"  # type: ignore[attr-defined]
             raise InputError(f"is {data!r}", where=where, remedy=remedy)
         return _part_from_dict(hint, data, where)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
@@ -208,9 +209,8 @@ def _part_from_dict(interface: type, data: Mapping[str, Any], where: str) -> Any
         load_installed()
         choices = registered(kind)
     if not isinstance(name, str) or name not in choices:
-        raise InputError(
-            f"there is no {kind} called {name!r}", where=where, remedy=f"use one of {list(choices)}"
-        )
+        problem = "names no part" if name is None else f"there is no {kind} called {name!r}"
+        raise InputError(problem, where=where, remedy=f"set part to one of {_listed(choices)}")
     return _dataclass_from_dict(choices[name], options, where)
 
 
@@ -219,9 +219,8 @@ def _dataclass_from_dict(cls: type, data: Mapping[str, Any], where: str) -> Any:
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     unknown = [key for key in data if key not in fields]
     if unknown:
-        raise InputError(
-            f"unknown option {unknown[0]!r}", where=where, remedy=f"use one of {list(fields)}"
-        )
+        remedy = f"use one of {_listed(fields)}" if fields else "leave it out: there are none"
+        raise InputError(f"unknown option {unknown[0]!r}", where=where, remedy=remedy)
     missing = [name for name, f in fields.items() if name not in data and not _has_default(f)]
     if missing:
         raise InputError(f"{missing[0]!r} is missing", where=where, remedy=f"add {missing[0]}")
@@ -255,5 +254,9 @@ def _plain(hint: Any, data: Any, where: str) -> Any:
         and not (hint is not bool and isinstance(data, bool))
     ):
         return data
-    type_name = hint.__name__ if isinstance(hint, type) else str(hint)
-    raise InputError(f"is {data!r}", where=where, remedy=f"use a value of type {type_name}")
+    words = _TYPES.get(hint, f"a value of type {getattr(hint, '__name__', hint)}")
+    raise InputError(f"is {data!r}", where=where, remedy=f"use {words}")
+
+
+def _listed(choices: Iterable[Any]) -> str:
+    return ", ".join(map(str, choices))

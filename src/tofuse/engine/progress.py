@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame
 from tofuse.engine.graph import PoseGraph
 from tofuse.engine.results import FrameRecord
@@ -34,6 +35,19 @@ class OnlineMap:
     timestamps: Float64
     views: Sequence[PosedView[PreparedView]]
     degenerate: frozenset[int] = frozenset()
+
+
+def receiver(progress: Progress | bool | None) -> Progress:
+    """Return what receives the progress; InputError for an object that can't."""
+    if not progress:
+        return Silent()
+    if progress is True or not hasattr(progress, "began"):
+        raise InputError(
+            f"is {progress!r}",
+            where="progress",
+            remedy="pass an object that receives it; `reconstruct` shows True on the terminal",
+        )
+    return progress
 
 
 class Progress(Protocol):

@@ -7,6 +7,7 @@ from math import inf
 from tofuse.apps.cli import options as cli
 from tofuse.apps.cli import print_result, progress_for, progress_unless_json, show
 from tofuse.engine.errors import InputError
+from tofuse.engine.quantities import count
 
 # Colour and exit status of the decisions of a plan, the best first.
 _DECISIONS = {"enough": ("green", 0), "undecided": ("yellow", 4), "not enough": ("red", 3)}
@@ -62,7 +63,7 @@ def simulate(arguments: cli.Simulate) -> int:
             sigma=arguments.sigma,
             progress=progress,
         )
-    print(f"{frames} frames in {arguments.out}")
+    print(f"{count(frames, 'frame')} in {arguments.out}")
     return 0
 
 

@@ -42,14 +42,12 @@ from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping import (
     Config,
     adaptation,
-    changed,
-    checked,
-    from_method,
+    configured,
     reconstructing,
 )
 from tofuse.engine.mapping import Mapper as OnlineMapper
 from tofuse.engine.parts import name_of
-from tofuse.engine.progress import Progress, Silent
+from tofuse.engine.progress import Progress, Silent, receiver
 from tofuse.engine.results import Reconstruction, accuracy_card
 from tofuse.formats.rigs import check_one_camera
 
@@ -134,7 +132,7 @@ class Result(Reconstruction):
 
         if self.source is not None:
             config = self.fitted or adaptation.adapted(
-                _configuration(self.config, self.source), self.source
+                configured(self.config, reconstructing.view_kind(self.source)), self.source
             )
             write_report_files(self.source, config, result, folder)
             return
@@ -143,7 +141,7 @@ class Result(Reconstruction):
 
     def evaluate(
         self,
-        reference: str | Path | ArrayLike | None = None,
+        reference: str | Path | Recording | ArrayLike | None = None,
         *,
         reference_error_m: float | None = None,
     ) -> Evaluation:
@@ -152,8 +150,8 @@ class Result(Reconstruction):
         Parameters
         ----------
         reference
-            A file, or (N, 4, 4) T_world_camera of the same frames, NaN where there is none. None:
-            the reference poses of the recording.
+            A file, a recording with reference poses, or (N, 4, 4) T_world_camera of the same
+            frames, NaN where there is none. None: the reference poses of the result's recording.
         reference_error_m
             Rms error of the reference itself, m.
 
@@ -168,12 +166,14 @@ class Result(Reconstruction):
         if poses is None:
             raise InputError(
                 "has no reference poses",
-                where="the recording" if self.source else "the loaded result",
+                where="the recording" if self.source else "the result",
                 remedy="pass a reference",
             )
         return evaluate(
             self,
-            poses if isinstance(poses, str | Path) else se3.check_poses(poses, where="reference"),
+            poses
+            if isinstance(poses, str | Path | Recording)
+            else se3.check_poses(poses, where="reference"),
             recording=self.source,
             reference_error_m=reference_error_m,
             config=self.config,
@@ -295,7 +295,7 @@ class Mapper(OnlineMapper):
     Parameters
     ----------
     config
-        A configuration, or the name of one.
+        A configuration, or the name of one; or options, as for `reconstruct`.
     seed
         The result is reproducible for each seed.
     threads
@@ -369,7 +369,7 @@ def reconstruct(
         )
     check_one_camera(recording)
     with _with_terminal(progress) as display:
-        chosen = _configuration(config, recording)
+        chosen = configured(config, reconstructing.view_kind(recording))
         # No sensor measures the motion relative to a moving object.
         filters = {name_of(part) for part in chosen.filters}
         if not filters & {"background", "foreground"}:
@@ -381,16 +381,6 @@ def reconstruct(
             recording, fitted, seed=seed, threads=threads, loops=loops, progress=display
         )
     return Result.of(with_findings(reconstruction, findings, turning=turning), recording, fitted)
-
-
-def _configuration(config: Config | str | Mapping[str, Any], recording: Recording) -> Config:
-    kind = reconstructing.view_kind(recording)
-    if isinstance(config, str):
-        return from_method(config, kind)
-    if isinstance(config, Mapping):
-        options = {name: value for name, value in config.items() if name != "method"}
-        return changed(from_method(config.get("method", "default"), kind), options, where="config")
-    return checked(config)
 
 
 def merge(
@@ -430,8 +420,8 @@ def merge(
     return Result.of(merged)
 
 
-def _with_terminal(progress: Progress | bool | None) -> AbstractContextManager[Progress | None]:
-    return TerminalProgress(sys.stderr) if progress is True else nullcontext(progress or None)
+def _with_terminal(progress: Progress | bool | None) -> AbstractContextManager[Progress]:
+    return TerminalProgress(sys.stderr) if progress is True else nullcontext(receiver(progress))
 
 
 def load(folder: str | Path, *, edited: bool = False) -> Result:

@@ -43,8 +43,15 @@ class LensFile:
     format: str
 
 
-def read_lens_file(path: str | Path) -> LensFile:
+def read_lens_file(path: str | Path, size: tuple[int, int] | None = None) -> LensFile:
     """Read a lens from a .yml, .yaml, .xml or .json of OpenCV, or a camera_info .yaml of ROS.
+
+    Parameters
+    ----------
+    path
+        The file.
+    size
+        Width and height of the images, if the file does not state them.
 
     Raises
     ------
@@ -60,11 +67,13 @@ def read_lens_file(path: str | Path) -> LensFile:
             where=path,
             remedy="check the file",
         )
-    size = [*(_numbers(text, _WIDTH) or []), *(_numbers(text, _HEIGHT) or [])]
-    size = size or _numbers(text, _SIZE) or []
-    if len(size) != 2:
+    stated = [*(_numbers(text, _WIDTH) or []), *(_numbers(text, _HEIGHT) or [])]
+    stated = stated or _numbers(text, _SIZE) or list(size or ())
+    if len(stated) != 2:
         raise InputError(
-            "doesn't state the image size", where=path, remedy="add image_width and image_height"
+            "doesn't state the image size",
+            where=path,
+            remedy="add image_width and image_height, or pass --recording",
         )
     k = _numbers(text, _DISTORTION) or []
     ros_model = re.search(r"""distortion_model["']?\s*:\s*["']?(\w+)""", text)
@@ -87,7 +96,7 @@ def read_lens_file(path: str | Path) -> LensFile:
             where=path,
             remedy=f"calibrate with {len(order)}, without thin prism or tilted sensor",
         )
-    width, height = camera_file.image_size(size[0], size[1], f"{path}: image size")
+    width, height = camera_file.image_size(stated[0], stated[1], f"{path}: image size")
     K = np.reshape(matrix, (3, 3))
     if K[2, :2].any() and not K[:2, 2].any():  # Open3D writes it column by column
         K = K.T

@@ -25,7 +25,7 @@ from tofuse.apps.cli.options import Calibrate, Noise
 from tofuse.apps.cli.progress import escaped
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import Recording
+from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.quantities import count
 from tofuse.engine.sensor import DepthCorrection
 from tofuse.formats.cameras import camera_file, read_correction, write_correction, write_noise
@@ -152,15 +152,23 @@ def _import_lens(arguments: Calibrate) -> Summary:
     """``tofuse calibrate import``."""
     if len(arguments.inputs) != 1:
         raise InputError("takes one file", where="calibrate import", remedy="pass one INPUT")
-    lens_file = read_lens_file(arguments.inputs[0])
     metadata: dict[str, Any] = {}
     warnings: list[str] = []
-    if arguments.recording is None:
+    recording = None if arguments.recording is None else open_recording(arguments.recording)
+    frame = None if recording is None else recording.first_readable()
+    size = (frame.camera.width, frame.camera.height) if isinstance(frame, RangeFrame) else None
+    lens_file = read_lens_file(arguments.inputs[0], size)
+    own = lens_file.camera.width, lens_file.camera.height
+    if size not in (None, own):
+        warnings.append(
+            f"the lens is that of images of {own[0]} x {own[1]} pixels, and those of "
+            f"{arguments.recording} have {size[0]} x {size[1]}: calibrate images of that size"
+        )
+    if recording is None:
         warnings.append(
             "depth is assumed to be z in mm; pass --recording to take it from a recording"
         )
     else:
-        recording = open_recording(arguments.recording)
         metadata = recording_fields(recording)
     fields = camera_file.camera_fields(lens_file.camera)
     lines = [f"{name} {value}" for name, value in fields.items()]

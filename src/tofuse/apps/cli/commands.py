@@ -397,7 +397,7 @@ def convert(arguments: cli.Convert) -> int:
     else:
         conversion = convert_to(recording, arguments.out, arguments.to)
     _print_lines(
-        f"{conversion.frames} frames in {escaped(str(conversion.folder))}",
+        f"{count(conversion.frames, 'frame')} in {escaped(str(conversion.folder))}",
         *warning_lines((*recording.warnings, *conversion.warnings)),
     )
     return 0
@@ -436,7 +436,7 @@ def record(arguments: cli.Record) -> int:
         )
     warnings = [f"{recorded.dropped} frames dropped: the disk was too slow"]
     _print_lines(
-        f"{recorded.frames} frames in {escaped(str(recorded.folder))}",
+        f"{count(recorded.frames, 'frame')} in {escaped(str(recorded.folder))}",
         *warning_lines(warnings if recorded.dropped else []),
         *warning_lines([recorded.ended_by] if recorded.ended_by != "asked" else []),
     )

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 _BROKEN_PIPE = 128 + 13  # as if terminated by SIGPIPE
 _UNCHANGED = "existing files are unchanged, or the new result is complete"
 _INTERRUPTED, _TERMINATED = f"interrupted; {_UNCHANGED}", f"terminated; {_UNCHANGED}"
+_ENDED = tuple(128 + number for number in (1, 2, 15, 21))  # by SIGHUP, SIGINT, SIGTERM, SIGBREAK
+_GRACE_S = 5.0  # for threads, after the command has been interrupted
 _MEMORY = "out of memory; use --every, --max-depth or a larger voxel_m"
 
 
@@ -36,12 +38,29 @@ def console() -> int:
         prepare_process()
         with ended_by_signals():
             status = report_bugs(main)
+        if status in _ENDED:
+            _end_at_last(status)
         # Avoids a last garbage collection at exit, which takes half a second.
         gc.freeze()
     except KeyboardInterrupt:  # before the command began, or after it ended
         _print_error(_INTERRUPTED)
+        _end_at_last(130)
         return 130
     return status
+
+
+def _end_at_last(status: int) -> None:
+    """End this process soon, even if another thread never ends.
+
+    Python waits for all threads. One of them may wait for a lock that the main thread had taken or
+    released in a library, such as LLVM's, as the signal arrived.
+    """
+
+    def end() -> None:
+        sleep(_GRACE_S)
+        os._exit(status)
+
+    _thread.start_new_thread(end, ())
 
 
 def prepare_process() -> None:

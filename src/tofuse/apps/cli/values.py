@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -32,10 +33,13 @@ def reader(kind: type, extra: object) -> Callable[[str], Any]:
 
 
 def path(text: str) -> Path:
-    """Read a path; an empty one, as of a shell variable that is not set, is no current folder."""
+    """Read a path; an empty one, as of a shell variable that is not set, is no current folder.
+
+    Shells leave a ~ after ``--out=`` as it is.
+    """
     if not text:
         raise argparse.ArgumentTypeError("'' is not a path")
-    return Path(text)
+    return Path(os.path.expanduser(text))
 
 
 def _number(text: str, kind: type) -> Any:

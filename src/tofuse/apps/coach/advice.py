@@ -8,6 +8,7 @@ import numpy as np
 
 from tofuse.apps.certainty import Known
 from tofuse.engine.arrays import Float64
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import Mapper
@@ -84,9 +85,20 @@ def advise(source: Mapper | Reconstruction) -> Advice | None:
     Returns
     -------
     The advice; None if too little is known.
+
+    Raises
+    ------
+    InputError
+        If it is neither.
     """
     if isinstance(source, Mapper):
         return advise_on(source.so_far())
+    if not isinstance(source, Reconstruction):
+        raise InputError(
+            f"is a {type(source).__name__}, neither a mapper nor a result",
+            where="source",
+            remedy="pass a tofuse.Mapper, or a result of tofuse.reconstruct or tofuse.load",
+        )
     recording = getattr(source, "source", None)
     known = Known.of_result(source, None if recording is None else recording.first_readable())
     return None if known is None else best(known)

@@ -29,7 +29,7 @@ from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.fusion import GeometryRecord, Mesh, texture
 from tofuse.engine.times import nearest
 from tofuse.formats.export import exchange
-from tofuse.formats.files import atomic, staging, stamps
+from tofuse.formats.files import atomic, reading, staging, stamps
 from tofuse.formats.geometry import read_textured_glb
 from tofuse.formats.images import jpeg_bytes
 from tofuse.formats.poses import read_tum, write_kitti, write_log
@@ -191,6 +191,14 @@ FORMATS: dict[str, tuple[str, Callable[[_Result, Path], None]]] = {
     "octomap": ("octomap.bt", lambda result, path: result.grid.write_octomap(path)),
 }
 
+# Packages that formats need, and the extras that install them.
+_NEEDED = {
+    "e57": ("pye57", "scan"),
+    "stl": ("trimesh", None),
+    "rerun": ("rerun", "rerun"),
+    "mcap": ("mcap.writer", "mcap"),
+}
+
 
 def export(
     folder: str | Path,
@@ -242,6 +250,9 @@ def export(
         raise InputError(
             f"unknown format {unknown[0]}", where="FORMAT", remedy=f"use one of {available}"
         )
+    for name in formats:
+        if name in _NEEDED:  # before minutes are spent on other formats
+            reading.required_package(*_NEEDED[name], f"tofuse export {name}")
     target = folder if out is None else Path(out)
     files = {name: target / FORMATS[name][0] for name in dict.fromkeys(formats)}
     with (

@@ -17,7 +17,7 @@ from tofuse.apps.inspection.sample import Sample
 from tofuse.apps.inspection.values import depths_of, valid_fraction
 from tofuse.engine.arrays import Float32
 from tofuse.engine.cameras import Pinhole, RayTable
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, shown
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.noise import family_of
 from tofuse.engine.quantities import percent
@@ -150,7 +150,7 @@ def _facts(recording: Recording, frames: Sequence[Frame]) -> dict[str, str]:
         known = 0 if poses is None else int(np.isfinite(poses[:, 0, 0]).sum())
         facts[name] = "none" if poses is None else f"for {known} frames"
     return facts | {
-        name: str(value)
+        name: shown(str(value))
         for name, value in recording.metadata.items()
         if isinstance(value, str | int | float) and name != "depth_kind"
     }

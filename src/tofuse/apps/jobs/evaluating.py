@@ -25,7 +25,7 @@ from tofuse.formats.files import reading
 from tofuse.formats.poses import Clock, TimedPoses, associated_poses, read_poses
 from tofuse.formats.recordings import open_recording, read_reference
 
-Poses = str | Path | Float64 | Reconstruction
+Poses = str | Path | Float64 | Reconstruction | Recording
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +81,8 @@ def evaluate(
     ----------
     estimate, reference
         A file or folder of any supported format (a result, a recording with a reference), a
-        result in memory, or (N, 4, 4) T_world_camera of the frames of the recording, NaN where
-        there is none.
+        result or a recording in memory, or (N, 4, 4) T_world_camera of the frames of the recording,
+        NaN where there is none.
     recording
         Provides the timestamps of frames if the poses have none, and images whose map consistency
         is measured.
@@ -216,6 +216,11 @@ def _poses(source: Poses, name: str, *, is_reference: bool = False) -> TimedPose
         return read_reference(source) if is_reference else read_poses(source)
     if isinstance(source, Reconstruction):
         return TimedPoses(source.trajectory, timestamps=source.timestamps)
+    if isinstance(source, Recording):
+        if source.reference is None:
+            remedy = "pass a recording with poses, or a file of them"
+            raise InputError("has no reference poses", where=name, remedy=remedy)
+        return TimedPoses(source.reference, timestamps=source.timestamps)
     poses = se3.check_poses(source, where=name)
     return TimedPoses(poses, frames=np.arange(len(poses)))
 
@@ -224,7 +229,7 @@ def _timed(
     timed: TimedPoses, source: Poses, clock: Clock | None, name: str
 ) -> tuple[Float64, Float64]:
     """Return times (N,) and poses (N, 4, 4); those of an array are of the recording's frames."""
-    if isinstance(source, str | Path | Reconstruction) or clock is None:
+    if isinstance(source, str | Path | Reconstruction | Recording) or clock is None:
         return timed.timed(clock, name)
     if len(timed.poses) != len(clock[0]):
         raise InputError(

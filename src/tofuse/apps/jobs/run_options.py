@@ -19,6 +19,7 @@ from tofuse.engine.mapping import (
     from_method,
     texturing,
 )
+from tofuse.engine.parts import name_of
 from tofuse.engine.progress import Progress
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.sensor import range_and_amplitude
@@ -117,12 +118,19 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
     method = options.method or changes.get("method") or "default"
     if not isinstance(method, str):
         raise InputError(f"is {method!r}", where=f"{options.config}: method")
-    config = from_method(method, kind)
+    config = from_method(
+        method, kind, where="--method" if options.method else f"{options.config}: method"
+    )
     config = changed(config, {**changes, "method": method}, where=str(options.config or "--config"))
-    if options.guess:
-        config = changed(config, {"odometry": {"guess": options.guess}}, where="--guess")
-    if options.moving:
-        config = changed(config, {"odometry": {"moving": options.moving}}, where="--moving")
+    for name, value in (("guess", options.guess), ("moving", options.moving)):
+        if value and not hasattr(config.odometry, name):
+            raise InputError(
+                f"does not apply to the odometry {name_of(config.odometry)!r}",
+                where=f"--{name}",
+                remedy="leave it out, or use the method default for images",
+            )
+        if value:
+            config = changed(config, {"odometry": {name: value}}, where=f"--{name}")
     config = options.applied(config)
     if options.memory is not None:
         megabytes = options.memory // 1_000_000

@@ -143,7 +143,7 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
         progress.placed(frame, np.eye(4))
     config = resolve(options, reconstructing.view_kind(recording))
     if not options.object:  # no sensor measures the motion relative to a moving object
-        recording, config = adaptation.with_prior(recording, config, options.prior)
+        recording, config = adaptation.with_prior(recording, config, options.prior, where="--prior")
     check_guess(options, recording)
     if options.unwrap:
         check_unwrap(recording)

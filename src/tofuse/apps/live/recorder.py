@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.apps.live.device import DeviceError, Stream
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, OutputError, TofuseError
 from tofuse.engine.frames import RangeFrame
 from tofuse.formats.files import staging
 from tofuse.formats.recordings import RecordingWriter
@@ -35,7 +35,7 @@ class Recorded:
     dropped
         Number of frames dropped, as the disk was too slow.
     ended_by
-        Reason for the end: "asked" as requested, or the camera's error.
+        Reason for the end: "asked" as requested, or the error of the camera or the disk.
     """
 
     folder: Path
@@ -57,7 +57,8 @@ def record(
     """Write the frames of a camera as a native recording.
 
     The camera is read on its own thread, so that a slow disk drops frames without delaying others.
-    If the camera fails, the frames so far are kept. The folder appears when it is complete.
+    If the camera fails or the disk is full, the frames so far are kept. The folder appears when it
+    is complete.
 
     Parameters
     ----------
@@ -79,7 +80,7 @@ def record(
     DeviceError
         If the camera sent no frame.
     OutputError
-        If the folder isn't empty, or can't be written.
+        If the folder isn't empty, or no frame can be written.
     """
     if (seconds is not None and not seconds > 0) or (frames is not None and frames < 1):
         raise InputError("there is nothing to record", remedy="use more seconds, or frames")
@@ -89,10 +90,15 @@ def record(
             raise reader.error or DeviceError("sent no frame", where=stream.settings.sensor)
         writer = _writer(stream, first, temporary)
         frame: RangeFrame | None = first
+        failure: TofuseError | None = None
         while frame is not None:
             if seconds is not None and frame.timestamp - first.timestamp >= seconds:
                 break
-            writer.add(frame)
+            try:
+                writer.add(frame)
+            except OutputError as error:
+                failure = error
+                break
             if progress is not None:
                 progress(len(writer))
             if seen is not None:
@@ -100,9 +106,27 @@ def record(
             if len(writer) == frames or stopped():
                 break
             frame = reader.next()
-        ended_by = str(reader.error) if frame is None and reader.error else "asked"
-        writer.finish()
+        if frame is None:
+            failure = reader.error
+        failure = _finish(writer, failure)
+    ended_by = str(failure or "asked").replace(str(temporary), str(folder))
     return Recorded(Path(folder), len(writer), reader.dropped, ended_by)
+
+
+def _finish(writer: RecordingWriter, failure: TofuseError | None) -> TofuseError | None:
+    """Finish a recording, where the disk is full without some of the last frames.
+
+    Returns what it failed by, if it did; raises it if no frame is left.
+    """
+    while len(writer):
+        try:
+            writer.finish()
+            return failure
+        except OutputError as error:
+            failure = error
+            writer.remove_last()
+    assert failure is not None
+    raise failure
 
 
 class _Reader(AbstractContextManager["_Reader"]):

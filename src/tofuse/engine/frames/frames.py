@@ -6,7 +6,7 @@ of clouds needs. All arrays are read-only by convention: methods return new fram
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal, Self, get_args
@@ -122,6 +122,9 @@ class RangeFrame:
             if image is None:
                 continue
             last = (3,) if name in ("color_image", "normal_image") else ()
+            if isinstance(image, np.ma.MaskedArray):  # a masked pixel has no value
+                image = image.filled(np.nan if name == "normal_image" else 0)
+                object.__setattr__(self, name, image)
             is_array = isinstance(image, np.ndarray) and image.dtype.kind in "biuf"
             if not is_array or image.ndim != 2 + len(last) or image.shape[2:] != last:
                 given = f"an array of shape {image.shape}" if is_array else type(image).__name__
@@ -227,12 +230,11 @@ class RangeFrame:
 
     def keep(self, mask: Bool) -> Self:
         """Return the frame with every pixel outside the (H, W) mask made invalid."""
-        frame = object.__new__(type(self))
-        # Without the checks of __post_init__, which this frame has passed.
-        for attribute in fields(self):
-            object.__setattr__(frame, attribute.name, getattr(self, attribute.name))
-        object.__setattr__(frame, "depth", np.where(mask, self.depth, np.float32(0)))
-        return frame
+        return _unchecked(self, depth=np.where(mask, self.depth, np.float32(0)))
+
+    def copy(self) -> Self:
+        """Return the frame with arrays of its own."""
+        return _unchecked(self, **_copies(self, IMAGES))
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,8 +384,27 @@ class CloudFrame:
         kept: dict[str, Any] = {n: v if v is None else v[mask] for n, v in columns.items()}
         return replace(self, **kept)
 
+    def copy(self) -> Self:
+        """Return the view with arrays of its own."""
+        return _unchecked(self, **_copies(self, COLUMNS))
+
 
 Frame = RangeFrame | CloudFrame
+
+
+def _unchecked(frame: Frame, **changes: Any) -> Any:
+    """Return a frame that has passed the checks of __post_init__, with some fields replaced."""
+    changed = object.__new__(type(frame))
+    for attribute in fields(frame):
+        value = changes.get(attribute.name, getattr(frame, attribute.name))
+        object.__setattr__(changed, attribute.name, value)
+    return changed
+
+
+def _copies(frame: Frame, names: Sequence[str]) -> dict[str, Any]:
+    arrays = {name: getattr(frame, name) for name in names}
+    return {name: np.array(array) for name, array in arrays.items() if array is not None}
+
 
 # The resolution of float32 is coarser than half a millimetre beyond.
 _MAP_COORDINATES_M = 8192.0

@@ -33,9 +33,9 @@ def from_arrays(
     depth: ArrayLike | Sequence[ArrayLike],
     camera: Camera | ArrayLike,
     *,
-    color: ArrayLike | Sequence[ArrayLike] | None = None,
-    amplitude: ArrayLike | Sequence[ArrayLike] | None = None,
-    confidence: ArrayLike | Sequence[ArrayLike] | None = None,
+    color: ArrayLike | Sequence[ArrayLike | None] | None = None,
+    amplitude: ArrayLike | Sequence[ArrayLike | None] | None = None,
+    confidence: ArrayLike | Sequence[ArrayLike | None] | None = None,
     timestamps: ArrayLike | None = None,
     reference: ArrayLike | None = None,
     odometry: ArrayLike | None = None,
@@ -55,7 +55,8 @@ def from_arrays(
         A camera, or the matrix K (3, 3) of a pinhole camera without distortion, in pixels of the
         depth images.
     color
-        (N, H, W, 3) uint8 RGB at the pixels of depth.
+        (N, H, W, 3) uint8 RGB at the pixels of depth; or N images, None for frames without one, as
+        of `amplitude` and `confidence`.
     amplitude
         (N, H, W) counts, of the kind `amplitude_kind`.
     confidence
@@ -78,7 +79,7 @@ def from_arrays(
     InputError
         If shapes or types do not fit, or the depth can't be in the assumed unit.
     """
-    images = _images("depth", depth, None, "iuf")
+    images = _images("depth", depth, None, "iuf", has_gaps=False)
     shape = images[0].shape
     if len({image.dtype.kind == "f" for image in images}) > 1:
         raise InputError(
@@ -120,19 +121,30 @@ def from_arrays(
 
 
 def _images(
-    name: str, values: Any, shape: tuple[int, ...] | None, kinds: str = "iufb"
-) -> list[NDArray[Any]]:
+    name: str,
+    values: Any,
+    shape: tuple[int, ...] | None,
+    kinds: str = "iufb",
+    *,
+    has_gaps: bool = True,
+) -> list[Any]:
+    """The images as arrays (H, W, ...), None where there is none and `has_gaps`."""
     try:
         # A masked pixel has no value; `asarray` would return what is under the mask.
-        images = [np.ma.filled(image, 0) for image in values]
+        images: list[Any] = [v if v is None else np.ma.filled(v, 0) for v in values]
     except TypeError as error:
         raise InputError(
             "is not an array of images", where=name, remedy="pass (N, H, W)"
         ) from error
     if not images:
         raise InputError("contains no image", where=name)
+    missing = next((k for k, image in enumerate(images) if image is None), None)
+    if missing is not None and not has_gaps:
+        raise InputError(f"image {missing} is None", where=name, remedy="leave out such frames")
     expected = images[0].shape if shape is None else shape
     for k, image in enumerate(images):
+        if image is None:
+            continue
         if image.dtype.kind not in kinds:
             raise InputError(
                 f"image {k} is of type {image.dtype}",
@@ -154,16 +166,17 @@ def _optional(
     images: list[NDArray[Any]],
     dtype: type[np.generic],
     channels: int | None = None,
-) -> list[NDArray[Any]] | None:
+) -> list[NDArray[Any] | None] | None:
     if values is None:
         return None
     shape = images[0].shape if channels is None else (*images[0].shape, channels)
     converted = _images(name, values, shape)
     if len(converted) != len(images):
         raise InputError(f"contains {len(converted)} images, and depth {len(images)}", where=name)
-    if dtype is np.uint8 and any(image.dtype != np.uint8 for image in converted):
-        raise InputError(f"is {converted[0].dtype}", where=name, remedy="use uint8, from 0 to 255")
-    return [image.astype(dtype, copy=False) for image in converted]
+    wrong = [image.dtype for image in converted if image is not None and image.dtype != np.uint8]
+    if dtype is np.uint8 and wrong:
+        raise InputError(f"is {wrong[0]}", where=name, remedy="use uint8, from 0 to 255")
+    return [image if image is None else image.astype(dtype, copy=False) for image in converted]
 
 
 def _to_metres(
@@ -206,7 +219,9 @@ def _camera(camera: Camera | ArrayLike, shape: tuple[int, ...], count: int) -> C
         K = np.asarray(camera, float)
     except (TypeError, ValueError) as error:
         raise InputError(
-            "is neither a camera nor a matrix", where="camera", remedy="pass K (3, 3)"
+            f"is a {type(camera).__name__}, neither a camera nor a matrix",
+            where="camera",
+            remedy="pass K (3, 3), or a camera such as tofuse.Pinhole",
         ) from error
     values = pinhole_values(K, (count, height, width), "camera")
     if not (-0.5 <= values["cx"] <= width - 0.5 and -0.5 <= values["cy"] <= height - 0.5):

@@ -190,7 +190,7 @@ class Recording:
             If the selection is empty.
         """
         if every < 1:
-            raise InputError(f"is {every}", where="--every", remedy="use 1 or more")
+            raise InputError(f"is {every}", where="every", remedy="use 1 or more")
         indices = self.indices[slice(start, end, every)]
         if len(indices) == 0:
             raise InputError(

@@ -17,11 +17,10 @@ if TYPE_CHECKING:
         ViewKind,
         changed,
         check_views,
-        checked,
         kind_of,
     )
     from tofuse.engine.mapping.frame_log import FrameLog
     from tofuse.engine.mapping.mapper import Mapper
-    from tofuse.engine.mapping.methods import default, from_method
+    from tofuse.engine.mapping.methods import configured, default, from_method
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -245,7 +245,9 @@ def _fitted_parts(
 Prior = Literal["auto", "none", "device"]
 
 
-def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Recording, Config]:
+def with_prior(
+    recording: Recording, config: Config, prior: Prior, *, where: str = "prior"
+) -> tuple[Recording, Config]:
     """Return the recording and the configuration with the chosen priors.
 
     Parameters
@@ -256,6 +258,8 @@ def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Reco
         "none": no external sensor; "device": gravity if known, and the poses of the odometry or of
         the device; "auto": those of the configuration, and if it uses gravity, also the poses of
         the device.
+    where
+        Names the argument in errors.
 
     Raises
     ------
@@ -263,7 +267,7 @@ def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Reco
         If the prior is "device" and the recording has no poses of its device.
     """
     if prior not in get_args(Prior):
-        raise InputError(f"is {prior!r}", where="--prior", remedy="use auto, none or device")
+        raise InputError(f"is {prior!r}", where=where, remedy="use auto, none or device")
     if prior == "none":
         return recording, replace(config, priors=())
     uses_odometry = _uses(config, external_sensors.OdometryEdges)
@@ -275,8 +279,8 @@ def with_prior(recording: Recording, config: Config, prior: Prior) -> tuple[Reco
         if poses is None:
             raise InputError(
                 "is device, and the recording has no poses of its device",
-                where="--prior",
-                remedy="put an odometry.txt next to the images, or use --prior auto",
+                where=where,
+                remedy="put an odometry.txt next to the images, or use auto",
             )
         recording = with_odometry(recording, poses)
     if uses_odometry:

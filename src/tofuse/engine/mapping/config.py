@@ -118,7 +118,7 @@ def checked(config: Any) -> Config:
         raise InputError(
             f"is a {type(config).__name__}, not a configuration",
             where="config",
-            remedy='pass the name of one, such as "default", or a Config',
+            remedy='pass the name of one, such as "default", or a dictionary of options',
         )
     return config
 

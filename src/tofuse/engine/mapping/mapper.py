@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,14 +20,14 @@ from tofuse.engine.mapping import adaptation
 from tofuse.engine.mapping.assembly import Assembly
 from tofuse.engine.mapping.backend import Job
 from tofuse.engine.mapping.color_frames import ColorFrames
-from tofuse.engine.mapping.config import Config, check_views, checked, kind_of
+from tofuse.engine.mapping.config import Config, check_views, kind_of
 from tofuse.engine.mapping.frame_log import FrameLog, FrameSequence, record_of
 from tofuse.engine.mapping.live_poses import LivePoses
-from tofuse.engine.mapping.methods import from_method
+from tofuse.engine.mapping.methods import configured
 from tofuse.engine.mapping.observations import Observations
 from tofuse.engine.mapping.preparation import FilteredFrame, Preparation, Prepared
 from tofuse.engine.parts import check_number
-from tofuse.engine.progress import OnlineMap, Progress, Silent
+from tofuse.engine.progress import OnlineMap, Progress, receiver
 from tofuse.engine.results import FrameRecord, Reconstruction
 from tofuse.engine.stopwatch import current, timing
 from tofuse.engine.stored_views import PosedView
@@ -48,7 +48,8 @@ class Mapper:
     Parameters
     ----------
     config
-        A configuration, or the name of one.
+        A configuration, or the name of one; or options that differ from the default, as in a TOML
+        file of ``--config``: ``{"fusion": {"voxel_m": 0.01}}``.
     seed
         The result is reproducible for each seed.
     threads
@@ -68,7 +69,7 @@ class Mapper:
 
     def __init__(
         self,
-        config: Config | str = "default",
+        config: Config | str | Mapping[str, Any] = "default",
         *,
         seed: int = 0,
         threads: int | None = None,
@@ -79,18 +80,17 @@ class Mapper:
         colors: ColorFrames | None = None,
     ) -> None:
         check_number(seed, Bounds(0), "seed", whole=True)
-        self.config = from_method(config) if isinstance(config, str) else checked(config)
-        self._method = config if isinstance(config, str) else None
+        if threads is not None:
+            check_number(threads, Bounds(1), "threads", whole=True)
+        self.config = configured(config)
+        self._given = config
         self.seed = seed
         self.threads = threads if threads is not None else thread_count()
         if self.threads > 1:
             ahead.load_in_background()
         self.watch = current()
         self._prior_loops, self._surface = prior_loops(loops), surface
-        if progress and not hasattr(progress, "began"):
-            remedy = "pass an object that receives it; `reconstruct` shows it on the terminal"
-            raise InputError(f"is {progress!r}", where="progress", remedy=remedy)
-        self._progress = progress or Silent()
+        self._progress = receiver(progress)
         self._sequence = FrameSequence()
         self._log = FrameLog()
         self._finished = False
@@ -123,11 +123,12 @@ class Mapper:
         Parameters
         ----------
         frame
-            Uncorrected and unfiltered. Its `index` must be larger than those before.
+            Uncorrected and unfiltered. Its `index` must be larger than those before. Without
+            `history` it is copied: a camera may write the next image into the same arrays.
         T_odometry
             (4, 4) T_world_camera from odometry or a phone, in any fixed world frame; None or NaN
             where there is none. It is a prior if the configuration has the part "odometry", or is
-            a name and uses gravity.
+            given by name or options and uses gravity.
         gravity
             (4,) unit vector of gravity in the camera's frame, (0, 1, 0) if it is level, and its
             sigma in rad; None or NaN where there is none. An accelerometer at rest measures the
@@ -153,6 +154,8 @@ class Mapper:
         """
         T_given, down = _odometry(T_odometry), _direction(gravity)
         frame, T_given = self._check(frame, T_given)
+        if history is None:
+            frame = frame.copy()
         repeated = self._sequence.is_repeated(frame)
         if repeated:
             self._log.repeated.append(frame.index)
@@ -240,6 +243,7 @@ class Mapper:
             Provides corrections, filters and odometry of the new recording; None keeps the current
             ones. Its component numbers must not have been used before.
         """
+        self._check_open()
         if self._log.entries:
             self._log.interruptions.append(len(self._log.entries))
         self._tracker.interrupt()
@@ -301,9 +305,8 @@ class Mapper:
                 self._observations.finish()
             del self._sequence, self._tracker, self._given_tracker  # the last frame, and keyframes
             trim_memory()
-            if self._method is not None and any(
-                e.T_odometry is not None for e in self._log.entries
-            ):
+            is_fixed = isinstance(self._given, Config)
+            if not is_fixed and any(e.T_odometry is not None for e in self._log.entries):
                 self.config = adaptation.with_odometry_prior(self.config)
             job = Job(
                 self.config, self._observations, self._prior_loops, self._progress, self._colors
@@ -329,8 +332,7 @@ class Mapper:
         kind = kind_of(frame)
         if self._sequence.check_kind(frame):
             if kind == "cloud":
-                if self._method is not None:
-                    self.config = from_method(self._method, kind)
+                self.config = configured(self._given, kind)
                 self._shift = frame.shift
                 self._prior_loops = tuple(p.about(-self._shift) for p in self._prior_loops)
                 self._start_method()

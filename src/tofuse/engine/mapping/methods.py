@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 from tofuse.engine.clouds import AnyPair
 from tofuse.engine.errors import InputError
@@ -12,7 +13,7 @@ from tofuse.engine.fusion import Fusion
 from tofuse.engine.graph import castellani, external_sensors, levenberg
 from tofuse.engine.icp import algorithm_1
 from tofuse.engine.loops import Confirmation, Nearby, Revisits
-from tofuse.engine.mapping.config import Config, ViewKind
+from tofuse.engine.mapping.config import Config, ViewKind, changed, checked
 from tofuse.engine.refinement import Joint, plane_refinement
 from tofuse.engine.sensor import Multipath, Noise, Wrapped
 from tofuse.engine.tracking import Keyframes, Pairwise, Sequential
@@ -87,11 +88,32 @@ def methods() -> dict[str, Callable[[ViewKind], Config]]:
     return {"default": default, "thesis": thesis}
 
 
-def from_method(name: str, kind: ViewKind = "range") -> Config:
+def configured(config: Config | str | Mapping[str, Any], kind: ViewKind = "range") -> Config:
+    """Return a configuration for a kind of view.
+
+    Parameters
+    ----------
+    config
+        The configuration, or its name; or options that differ from the default, as in a TOML file.
+    kind
+        The kind of view.
+
+    Raises
+    ------
+    InputError
+        If it is nothing of these, or an option does not exist.
+    """
+    if isinstance(config, str):
+        return from_method(config, kind)
+    if isinstance(config, Mapping):
+        options = {name: value for name, value in config.items() if name != "method"}
+        return changed(from_method(config.get("method", "default"), kind), options, where="config")
+    return checked(config)
+
+
+def from_method(name: str, kind: ViewKind = "range", *, where: str = "config") -> Config:
     """Return the configuration of that name for a kind of view; InputError if there is none."""
     available = methods()
     if not isinstance(name, str) or name not in available:
-        raise InputError(
-            f"is {name!r}", where="--method", remedy=f"use one of {', '.join(available)}"
-        )
+        raise InputError(f"is {name!r}", where=where, remedy=f"use one of {', '.join(available)}")
     return available[name](kind)

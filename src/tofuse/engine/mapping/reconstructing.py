@@ -20,7 +20,7 @@ from tofuse.engine.mapping.color_frames import ColorFrames
 from tofuse.engine.mapping.config import Config, ViewKind, kind_of
 from tofuse.engine.mapping.frame_log import FrameLog
 from tofuse.engine.mapping.mapper import Mapper, prior_loops
-from tofuse.engine.mapping.methods import from_method
+from tofuse.engine.mapping.methods import configured
 from tofuse.engine.mapping.self_calibration import self_calibrated
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction
@@ -97,7 +97,7 @@ def reconstruct(
         return _with_facts(result, recording, config)
 
     with current().running():
-        config = from_method(config, view_kind(recording)) if isinstance(config, str) else config
+        config = configured(config, view_kind(recording))
         config = adapted(config, recording, threads, progress)
         result = reconstruct_with(config, tracked_frames)
         if not config.self_calibration:

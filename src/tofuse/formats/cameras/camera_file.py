@@ -26,6 +26,7 @@ SCHEMA = 1
 MAX_SLOPE = 1e4  # of a ray: 89.99 degrees off the axis
 AMPLITUDE_KINDS = ("raw", "range_compensated", "ir")
 
+_FOREIGN = "correct it, or convert a file of another program by `tofuse calibrate import`"
 _METRES = "the metres of one count, such as 0.001"
 _LENS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
 
@@ -111,8 +112,10 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
     InputError
         Naming file and field, with a remedy.
     """
-    data = reading.read_json(path)
+    data = reading.parse_json(reading.read_text(path, limit=64 << 20), path, _FOREIGN)
     get = _Fields(data, str(path))
+    if "schema" not in data:
+        raise InputError("has no schema, and is no camera.json", where=path, remedy=_FOREIGN)
     with reading.about(path):
         reading.check_schema(data, SCHEMA)
     camera = size = None

@@ -10,14 +10,23 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.engine.arrays import Float32, UInt8
+from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Frame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
-from tofuse.formats.sources import Reader, ReaderOptions, Sniff, bags, cloud_files, organised
+from tofuse.formats.sources import (
+    ACCELERATION,
+    Reader,
+    ReaderOptions,
+    Sniff,
+    bags,
+    cloud_files,
+    gravity_at,
+    organised,
+)
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
@@ -52,10 +61,13 @@ class RosSource(bags.BagSource):
     ----------
     raster
         The camera of clouds that are images of one; else None.
+    imu
+        Columns of the native imu.csv, in the axes of the depth camera; or None.
     """
 
     unit = 0.001  # integer depth is in mm by convention (REP 118)
     raster: Camera | None = None
+    imu: dict[str, Float64] | None = None
 
     def find_streams(self, options: ReaderOptions) -> None:
         """See `BagSource.find_streams`."""
@@ -80,6 +92,7 @@ class RosSource(bags.BagSource):
                 )
             self.raster = self._organised()
         self._read_poses(transforms)
+        self._read_gravity(transforms)
         self.metadata |= {"topic": self.connection.topic}
         others = sorted({c.topic for c in self._candidates()} - {self.connection.topic})
         if others and options.topic is None:
@@ -185,17 +198,23 @@ class RosSource(bags.BagSource):
     def _transforms(self) -> bags.Transforms:
         try:
             with reading.library_errors(self.path, bags.REMEDY):
-                return bags.Transforms.read(self.bag)
+                transforms = bags.Transforms.read(self.bag)
         except InputError as error:
             self.warnings.append(f"tf is ignored: {error}")
-            return bags.Transforms({})
+            transforms = bags.Transforms({})
+        try:
+            with reading.library_errors(self.path, bags.REMEDY):
+                transforms.add_odometry(self.bag)
+        except InputError as error:
+            self.warnings.append(f"odometry is ignored: {error}")
+        return transforms
 
     def _frame_of(self, track: bags.Track) -> str:
         """Name of the tf frame of the messages."""
         return bags.frame_name(track.message(0).header.frame_id)
 
     def _read_poses(self, transforms: bags.Transforms) -> None:
-        """Read the poses of the depth camera from tf."""
+        """Read the poses of the depth camera from tf, and from messages of odometry."""
         if not transforms:
             return
         try:
@@ -207,19 +226,51 @@ class RosSource(bags.BagSource):
         ancestors = transforms.ancestors(frame)
         if transforms.any_moves and not transforms.moves(ancestors[-1], frame):
             self.warnings.append(
-                f"tf has frames that move, but the frame of depth, {frame!r}, is attached to none "
-                "of them: if it should be, /tf_static was not recorded"
+                f"tf or odometry has frames that move, but the frame of depth, {frame!r}, is "
+                "attached to none of them: if it should be, /tf_static was not recorded"
             )
             return
-        odometry = next((name for name in ancestors if _ODOMETRY in name.lower()), None)
+        topics = transforms.odometry_topics
+        odometry = next((n for n in ancestors if n in topics or _ODOMETRY in n.lower()), None)
         if odometry is not None and transforms.moves(odometry, frame):
             poses = transforms.poses(odometry, frame, self.timestamps)
             if np.isfinite(poses).any():
                 self.odometry = poses
+                if odometry in topics:
+                    self.metadata["odometry_topic"] = topics[odometry]
         if ancestors[-1] != odometry and transforms.moves(ancestors[-1], frame):
             poses = transforms.poses(ancestors[-1], frame, self.timestamps)
             if np.isfinite(poses).any():
                 self.reference = poses
+
+    def _read_gravity(self, transforms: bags.Transforms) -> None:
+        """Read the direction of gravity from an accelerometer that is fixed to the camera."""
+        apart = None
+        for topic in sorted({c.topic for c in self.bag.connections if c.msgtype == bags.IMU_TYPE}):
+            try:
+                with reading.library_errors(self.path, bags.REMEDY):
+                    camera = self._frame_of(self.depth)
+                    measured = bags.accelerations(self.bag, topic)
+            except InputError as error:
+                self.warnings.append(f"{topic} is ignored: {error}")
+                continue
+            if measured is None:
+                continue
+            frame, columns = measured
+            T = transforms.static_transform(camera, frame)
+            if T is None:
+                apart = apart or (
+                    f"gravity in {topic} is ignored: the relation of its frame, {frame!r}, to that "
+                    f"of depth, {camera!r}, is not in the bag (/tf_static)"
+                )
+                continue
+            turned = T[:3, :3] @ np.array([columns[name] for name in ACCELERATION])
+            self.imu = columns | dict(zip(ACCELERATION, turned, strict=True))
+            self.gravity = gravity_at(self.timestamps, self.imu)
+            self.metadata["imu_topic"] = topic
+            return
+        if apart is not None:
+            self.warnings.append(apart)
 
     def _find_color(self, transforms: bags.Transforms) -> None:
         """Find a colour camera with known intrinsics and pose relative to depth."""

@@ -31,7 +31,7 @@ _COPY = "copy the file again, or export it again"
 
 @part("reader", "las")
 class LasScans(cloud_files.CloudReader):
-    """A .las or .laz file, or a folder of them; metres (extra `scan`)."""
+    """A .las or .laz file, or a folder of them; metres."""
 
     suffixes = (".las", ".laz")
 

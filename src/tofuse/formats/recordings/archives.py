@@ -55,7 +55,7 @@ def _unpack(path: Path) -> Path:
         size = sum(member.file_size for member in members)
         if size > shutil.disk_usage(folder).free:
             raise InputError(
-                f"needs {size / 1e9:.1f} GB in {folder.parent}, which are not free",
+                f"needs {size / 1e6:.0f} MB in {folder.parent}, which are not free",
                 where=path,
                 remedy=_REMEDY,
             )

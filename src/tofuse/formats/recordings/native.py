@@ -123,12 +123,29 @@ class RecordingWriter:
         ------
         InputError
             If the frame has another size, kind or set of channels than the first.
+        OutputError
+            If it can't be written; nothing of it is left.
         """
-        if isinstance(frame, CloudFrame):
-            self._write_cloud(frame)
-        else:
-            self._write_images(frame)
+        try:
+            if isinstance(frame, CloudFrame):
+                self._write_cloud(frame)
+            else:
+                self._write_images(frame)
+        except OutputError:
+            self._remove_files()
+            raise
         self._times.append(float(frame.timestamp))
+
+    def remove_last(self) -> None:
+        """Remove the last frame."""
+        self._times.pop()
+        del self._lenses[len(self) :]
+        self._remove_files()
+
+    def _remove_files(self) -> None:
+        """Remove the files of the frame that would be the next."""
+        for path in self.folder.glob(f"*/{len(self):06d}.*"):
+            path.unlink()
 
     def _frame_path(self, channel: str, suffix: str) -> Path:
         return atomic.make_folder(self.folder / channel) / f"{len(self):06d}{suffix}"

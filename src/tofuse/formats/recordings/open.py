@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from tofuse.engine.bounds import Bounds
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import NOISE_MODEL, CloudFrame, Frame, RangeFrame, Recording, Source
-from tofuse.engine.parts import discover, name_of, registered
+from tofuse.engine.parts import check_number, discover, name_of, registered
 from tofuse.formats.cameras import read_noise
 from tofuse.formats.files import reading
 from tofuse.formats.geometry import is_surface, read_surface, surface_points
@@ -105,6 +106,9 @@ def open_recording(
         reading.path_of(path, "path", "pass a path, or several: tofuse.open(a, b)")
     if not paths:
         raise InputError("no recording was given", remedy="pass a path")
+    for name, file in (("camera", camera), ("rig", rig)):
+        if file is not None:
+            reading.path_of(file, name, f"pass the path of a {name}.json")
     _check_depths(min_depth, max_depth)
     inner = [unzipped(path) for path in paths]
     options = ReaderOptions(None if camera is None else Path(camera), topic)
@@ -351,8 +355,8 @@ def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) ->
 
 def _check_depths(min_depth: float | None, max_depth: float | None) -> None:
     for name, value in (("--min-depth", min_depth), ("--max-depth", max_depth)):
-        if value is not None and not value >= 0:
-            raise InputError(f"is {value}", where=name, remedy="use metres, 0 or more")
+        if value is not None:
+            check_number(value, Bounds(0), name)
     if min_depth is not None and max_depth is not None and min_depth >= max_depth:
         raise InputError(
             f"{min_depth} and {max_depth} leave no points",

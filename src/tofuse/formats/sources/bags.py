@@ -27,6 +27,7 @@ from tofuse.formats.files import reading
 from tofuse.formats.geometry import unpacked_color
 from tofuse.formats.images import as_color, parse_image
 from tofuse.formats.sources.file_source import FileSource
+from tofuse.formats.sources.imu import ACCELERATION
 from tofuse.formats.sources.pixels import finite_float32, sampled_color
 from tofuse.formats.sources.reader import ReaderOptions
 
@@ -516,8 +517,8 @@ def cloud(message: Any, where: str) -> GeometryRecord:
     return GeometryRecord(points, color=color, scalars=scalars)
 
 
-_ROS2_TYPE = "tf2_msgs/msg/TFMessage"
-_ROS1_TYPE = "tf/msg/tfMessage"
+_TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")  # of ROS 2 and 1
+_ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 _STATIC = "static"  # in the name of the topic
 # Largest interval between transforms to interpolate, and largest extrapolation, s.
 _MAX_GAP_S, _MAX_EXTRAPOLATION_S = 0.5, 0.02
@@ -554,31 +555,52 @@ class _Edge:
 
 
 class Transforms:
-    """The tf tree of a bag."""
+    """The tf tree of a bag, with the motions that only messages of odometry state.
+
+    Attributes
+    ----------
+    odometry_topics
+        Topics of these messages, by the fixed frame of their poses.
+    """
 
     def __init__(self, edges: dict[str, _Edge]) -> None:
         self._edges = edges
+        self.odometry_topics: dict[str, str] = {}
 
     @classmethod
     def read(cls, bag: Any) -> Transforms:
         """Read all transforms of a bag, except those that are not rigid motions."""
-        connections = [c for c in bag.connections if c.msgtype in (_ROS2_TYPE, _ROS1_TYPE)]
-        rows: dict[str, list[tuple[float, str, Float64]]] = {}
+        rows: dict[str, list[_Row]] = {}
         static: set[str] = set()
-        if connections:
-            for connection, _, raw in bag.messages(connections=connections):
-                message = bag.deserialize(raw, connection.msgtype)
-                for transform in message.transforms:
-                    child = frame_name(transform.child_frame_id)
-                    row = _row(transform)
-                    if row is None:
-                        continue
-                    rows.setdefault(child, []).append(row)
-                    if _STATIC in connection.topic:
-                        static.add(child)
-        return cls(
-            {child: _edge(child_rows, child in static) for child, child_rows in rows.items()}
-        )
+        for topic, message in _messages(bag, *_TF_TYPES):
+            for transform in message.transforms:
+                child = frame_name(transform.child_frame_id)
+                motion = transform.transform
+                row = _row(transform.header, motion.translation, motion.rotation)
+                if row is None:
+                    continue
+                rows.setdefault(child, []).append(row)
+                if _STATIC in topic:
+                    static.add(child)
+        return cls({child: _edge(found, child in static) for child, found in rows.items()})
+
+    def add_odometry(self, bag: Any) -> None:
+        """Add the poses of messages of odometry, where tf does not state the motion itself."""
+        rows: dict[tuple[str, str], list[_Row]] = {}
+        for topic, message in _messages(bag, _ODOMETRY_TYPE):
+            pose, child = message.pose.pose, frame_name(message.child_frame_id)
+            row = _row(message.header, pose.position, pose.orientation)
+            if row is not None and child:
+                rows.setdefault((topic, child), []).append(row)
+        for (topic, child), found in sorted(rows.items()):
+            root = self.ancestors(child)[-1]
+            T_child_root = self.static_transform(child, root)
+            if T_child_root is None:  # it moves already: in tf, or by another topic
+                continue
+            edge = _edge([(time, parent, T @ T_child_root) for time, parent, T in found], False)
+            if root not in self.ancestors(edge.parent):
+                self._edges[root] = edge
+                self.odometry_topics[edge.parent] = topic
 
     def __bool__(self) -> bool:
         return bool(self._edges)
@@ -634,9 +656,44 @@ def frame_name(name: Any) -> str:
     return str(name).lstrip("/")
 
 
-def _row(transform: Any) -> tuple[float, str, Float64] | None:
-    """Time, parent and T_parent_child (4, 4) of a transform; None if it is not a rigid motion."""
-    t, q = transform.transform.translation, transform.transform.rotation
+IMU_TYPE = "sensor_msgs/msg/Imu"
+# Lengths of the acceleration at rest, m/s^2 or g; without gravity it is not as long.
+_AT_REST = ((9.81 / 1.2, 9.81 * 1.2), (1 / 1.2, 1.2))
+
+
+def accelerations(bag: Any, topic: str) -> tuple[str, dict[str, Float64]] | None:
+    """Return the frame of an accelerometer, and what it measures; None if that is not gravity.
+
+    Columns by name: `timestamp` (s), and `ax`, `ay`, `az` in its own axes.
+    """
+    connections = [c for c in bag.connections if (c.topic, c.msgtype) == (topic, IMU_TYPE)]
+    frame, rows = "", []
+    for _, _, raw in bag.messages(connections=connections):
+        message = bag.deserialize(raw, IMU_TYPE)
+        if message.linear_acceleration_covariance[0] == -1:  # it has none
+            return None
+        a, stamp = message.linear_acceleration, message.header.stamp
+        frame = frame_name(message.header.frame_id)
+        rows.append((stamp.sec + stamp.nanosec / 1e9, a.x, a.y, a.z))
+    columns = np.array(rows, float).reshape(-1, 4)
+    length = np.median(np.linalg.norm(columns[:, 1:], axis=1)) if rows else 0.0
+    if not any(low < length < high for low, high in _AT_REST):
+        return None
+    return frame, dict(zip(("timestamp", *ACCELERATION), columns.T, strict=True))
+
+
+def _messages(bag: Any, *kinds: str) -> Iterator[tuple[str, Any]]:
+    """Topic and content of all messages of some types."""
+    connections = [c for c in bag.connections if c.msgtype in kinds]
+    for connection, _, raw in bag.messages(connections=connections) if connections else ():
+        yield connection.topic, bag.deserialize(raw, connection.msgtype)
+
+
+_Row = tuple[float, str, Float64]
+
+
+def _row(header: Any, t: Any, q: Any) -> _Row | None:
+    """Time, parent and T_parent_child (4, 4) of a pose; None if it is not a rigid motion."""
     values = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w], float)
     if not np.isfinite(values).all() or abs(quaternion.length(values[3:]) - 1) > 0.01:
         return None
@@ -644,11 +701,11 @@ def _row(transform: Any) -> tuple[float, str, Float64] | None:
         T = se3.check_pose(quaternion.to_pose(values[3:], values[:3]), where="tf")
     except InputError:
         return None
-    stamp = transform.header.stamp
-    return float(stamp.sec) + float(stamp.nanosec) / 1e9, frame_name(transform.header.frame_id), T
+    stamp = header.stamp
+    return float(stamp.sec) + float(stamp.nanosec) / 1e9, frame_name(header.frame_id), T
 
 
-def _edge(rows: Sequence[tuple[float, str, Float64]], static: bool) -> _Edge:
+def _edge(rows: Sequence[_Row], static: bool) -> _Edge:
     parent = rows[-1][1]
     rows = sorted((row for row in rows if row[1] == parent), key=lambda row: row[0])
     times = np.array([row[0] for row in rows])

@@ -97,7 +97,7 @@ def _is_tof(rs: Any, serial: str) -> bool:
         raise DeviceError(
             f"no camera {serial} is connected" if serial else "no camera is connected",
             where="RealSense",
-            remedy="connect it, or pass its --serial",
+            remedy="connect it, or pass its number with --set serial=NUMBER",
         )
     return str(cameras[0].get_info(rs.camera_info.product_line)) == "L500"
 
