@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from tofuse.engine.refinement.calibration_check import (
     CalibrationCheck,
     check_calibration,
 )
-from tofuse.engine.refinement.camera_response import Linearised, Response, significance_of
+from tofuse.engine.refinement.camera_response import SECTIONS, Linearised, Response, significance_of
 from tofuse.engine.refinement.joint_alignment import (
     Priors,
     Refined,
@@ -90,6 +91,15 @@ def test_odometry_contradicts_errors_that_lead_away_from_it():
     assert check(refined.poses, slice(6), slice(6, None)).contradicted
 
 
+def test_sections_that_disagree_raise_no_alarm(monkeypatch):
+    monkeypatch.setattr(calibration_check, "_in_all_sections", lambda *_: False)
+    views, refined = kept(0.06)
+    found = check_calibration(RefinedViews(views, refined, OPTIONS))
+    assert not found.alarm
+    assert found.errors["offset"] == pytest.approx(0.06, abs=0.015)
+    assert found.is_likely  # the bound includes it
+
+
 def test_correct_camera_raises_no_alarm():
     views, refined = kept(0.0)
     found = check_calibration(RefinedViews(views, refined, OPTIONS))
@@ -97,6 +107,29 @@ def test_correct_camera_raises_no_alarm():
     assert found.gap is None
     # What the views estimate still counts: less than the uncertainty of the estimate.
     assert 0 < found.moved[0] < 3 * found.focal_sigma * found.motion["focal"][0]
+
+
+def test_sections_of_the_images_tell_whether_an_error_is_of_the_camera():
+    """Ranges 6 cm short: in the whole image, or in its right half as by multipath in a corner."""
+    found = []
+    for parts in (np.s_[:], np.s_[30:]):
+        rng, views = np.random.default_rng(3), []
+        for k, T in enumerate(path(12)):
+            frame = replace(corner(T), index=k)
+            depth = frame.depth + 0.003 * rng.standard_normal(frame.depth.shape)
+            depth[:, parts] += (corner(T, offset=0.06).depth - frame.depth)[:, parts]
+            frame = replace(frame, depth=depth.astype(np.float32))
+            views.append(SampledView.of(prepare_view(frame, SHARP), 1500))
+        refined = refine(views, path(12), OPTIONS)
+        linearised = Linearised.of(views, refined.poses, refined.pairs, OPTIONS, Priors.none())
+        whole, sections = linearised.response_to_errors(), linearised.response_of_sections()
+        error, by_sections = (of.estimate()[kernels.OFFSET] for of in (whole, sections))
+        assert by_sections == pytest.approx(error, rel=0.3)
+        found.append((error, sections.sigma_by_rows()[kernels.OFFSET]))
+    (everywhere, small), (in_part, large) = found
+    limit = significance_of(SECTIONS)
+    assert everywhere > limit * small
+    assert 0.01 < in_part < limit * large
 
 
 @pytest.mark.parametrize(("remaining_m", "alarm"), [(0.004, False), (0.006, True)])
@@ -116,10 +149,11 @@ def test_drift_that_a_usual_focal_length_explains_better_is_no_offset(
         def gap(self, before, after):
             return Gap(0, 11, (before, 0.0), (gaps.get(after, before), 0.0), 1.5)
 
-        def error_by_views(self, steps, error_index, error):
-            return error
+        def estimate_by_views(self, steps, error_index, error):
+            return SimpleNamespace(errors={error_index: error})
 
     monkeypatch.setattr(calibration_check, "Loop", ToldLoop)
+    monkeypatch.setattr(calibration_check, "_in_all_sections", lambda *_: True)
     views, refined = kept(0.0)
     found = check_calibration(RefinedViews(views, refined, OPTIONS))
     assert found.alarm == alarm
@@ -266,7 +300,8 @@ def test_views_keep_only_true_error_of_loop(true):
     loop = Loop.longest(RefinedViews(views, refined, OPTIONS))
     assert loop is not None
     steps = loop.steps(refined.poses)
-    assert loop.error_by_views(steps, kernels.OFFSET, 0.06) == pytest.approx(true, abs=0.02)
+    estimate = loop.estimate_by_views(steps, kernels.OFFSET, 0.06)
+    assert estimate.errors[kernels.OFFSET] == pytest.approx(true, abs=0.02)
 
 
 def test_longest_loop_uses_consecutive_views_only():

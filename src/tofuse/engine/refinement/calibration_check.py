@@ -23,9 +23,15 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
 from tofuse.engine.quantities import percent
-from tofuse.engine.refinement.camera_response import SIGNIFICANT, Linearised, significance_of
+from tofuse.engine.refinement.camera_response import (
+    SECTIONS,
+    SIGNIFICANT,
+    Linearised,
+    significance_of,
+)
 from tofuse.engine.refinement.joint_alignment import (
     AlignedViews,
+    Priors,
     RefinedViews,
     align_views,
     mean_support,
@@ -275,7 +281,8 @@ def _check_likely(
         check = replace(check, gap=gap, contradicted=estimator.is_contradicted(best))
     if check.contradicted:
         return check
-    if check.large and improves and check.confirmed_by_loop:  # alternative explanations
+    confirmed = best_name in check.large and improves and check.confirmed_by_loop
+    if confirmed and _in_all_sections(best, best_name, aligned.priors):  # alternative explanations
         others = [name for name in first.determined if name not in check.errors]
         more = {name: float(estimator.estimate([name]).errors[_INDEX[name]]) for name in others}
         return replace(check.with_errors(check.errors | more, first), alarm=True)
@@ -408,6 +415,19 @@ class _Estimator:
         return mean_support(estimate, self._poses)
 
 
+def _in_all_sections(estimate: AlignedViews, name: str, priors: Priors) -> bool:
+    """Whether sections of the images agree on an estimated error of the camera.
+
+    Multipath, mixed pixels and periodic errors of the range look like one in some of them.
+    """
+    state, k = estimate.state, _INDEX[name]
+    linearised = Linearised.of(
+        state.views, estimate.poses, estimate.pairs, state.options, priors, estimate.errors
+    )
+    sigma = linearised.response_of_sections().sigma_by_rows()[k]
+    return bool(abs(estimate.errors[k]) > significance_of(SECTIONS) * sigma)
+
+
 def combine_checks(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:
     """Combine the checks of the submaps of one recording.
 
@@ -465,9 +485,11 @@ def _check_by_loop(
         gap = loop.gap(uncorrected, corrected)
         if not gap.closes:
             return None
-        confirmed = loop.error_by_views(corrected, _INDEX[name], error)
+        by_views = loop.estimate_by_views(corrected, _INDEX[name], error)
+        confirmed = float(by_views.errors[_INDEX[name]])
         limit = without_error.significance * first.sigmas[name]
         large = all(_large(name, e, limit, _LOOP_FACTOR) for e in (error, confirmed))
+        large = large and _in_all_sections(by_views, name, Priors.none())
         return (error, gap, large) if confirmed * error > _MIN_CONFIRMED * error**2 else None
 
     names = [name for name in _REVEALED_BY_LOOP if name in first.determined]

@@ -1,4 +1,8 @@
-"""Response of refined views to errors of the camera: shared by all, or with a profile over them."""
+"""Response of refined views to errors of the camera: shared by all, or with a profile over them.
+
+Sections of the images tell errors of the camera from others that look like them, such as multipath
+or mixed pixels: an error of the camera is the same in all sections, near and far.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ import numpy as np
 from scipy.special import ndtr, stdtrit  # scipy.stats takes long to import
 
 from tofuse.engine.alignment import projective
-from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.arrays import Float32, Float64, Intp
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import sparse
@@ -17,9 +21,12 @@ from tofuse.engine.refinement.joint_alignment import DAMPING, Priors, weak_prior
 from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 
+# Quadrants of the images, each with a near and a far half.
+SECTIONS = 8
 # Significance of an error in standard deviations of a normal distribution.
 SIGNIFICANT = 4.0
 _SHARED = kernels.SOURCE_SCALE  # number of errors that all views share
+_ESTIMATE_ALL = np.zeros(kernels.ERRORS, np.int64)
 _MAX_CORRELATION = 0.97  # of errors of successive views
 
 
@@ -33,8 +40,8 @@ class Response:
     Attributes
     ----------
     gradient, information
-        (M, K) of each pair i < j, both directions together: first and second derivative of its
-        robust cost (Tukey's biweight) at zero error.
+        (M, K) of each pair i < j, both directions together, or of each section: first and second
+        derivative of its robust cost (Tukey's biweight).
     motion
         (K, N, 6) twist by which each pose follows, per unit of the error.
     """
@@ -63,6 +70,11 @@ class Response:
             Number of views.
         """
         return self._sigma((self._of_views(pairs, view_count) ** 2).sum(0), view_count)
+
+    def sigma_by_rows(self) -> Float64:
+        """(K,) standard deviations as of `sigma`, from the scatter between rows, as of sections."""
+        residual_gradient = self.gradient + self.information * self.estimate()
+        return self._sigma((residual_gradient**2).sum(0), len(self.gradient))
 
     def serial(self, pairs: Intp, view_count: int) -> tuple[Float64, Float64]:
         """Return standard deviations and effective numbers of views (K,) of profiles over time.
@@ -104,6 +116,42 @@ class Response:
         return np.asarray(information.sum(0) ** 2 / squares, np.float64)
 
 
+def _derivatives(
+    H: Float64, g: Float64, column: Float64, initial_motion: Float64, follow: Float64
+) -> tuple[Float64, Float64]:
+    """First and second derivatives (P,) of the costs of pairs by a combination of errors.
+
+    Parameters
+    ----------
+    H, g
+        As of `Linearised`.
+    column
+        (P, ERRORS) combination of the errors.
+    initial_motion, follow
+        (P, 6) motions of the relative poses: without the errors, and per unit of them.
+    """
+    mixed = (H[:, :6, 6:] @ column[..., None])[..., 0]
+    slope = g[:, :6] + (H[:, :6, :6] @ initial_motion[..., None])[..., 0]
+    first = (g[:, 6:] * column).sum(1) + (mixed * initial_motion).sum(1) + (slope * follow).sum(1)
+    second = (
+        np.einsum("mi,mij,mj->m", column, H[:, 6:, 6:], column)
+        + 2 * (mixed * follow).sum(1)
+        + np.einsum("mi,mij,mj->m", follow, H[:, :6, :6], follow)
+    )
+    return first, second
+
+
+def _sections(points: Float32) -> Intp:
+    """Return the section (N,) of each point (N, 3 or more) of a view."""
+    x, y = (points[:, :2] / points[:, 2:3]).T
+    section = 4 * (x > np.median(x)) + 2 * (y > np.median(y))
+    for quadrant in np.unique(section):
+        inside = section == quadrant
+        depth = points[inside, 2]
+        section[inside] += depth > np.median(depth)
+    return np.asarray(section, np.intp)
+
+
 def _by_view(of_pairs: Float64, pairs: Intp, view_count: int) -> Float64:
     """Return the sums (N, K) over the pairs of each view, given values (M, K) of pairs (M, 2)."""
     out = np.zeros((view_count, of_pairs.shape[1]))
@@ -118,8 +166,10 @@ class Linearised:
 
     Attributes
     ----------
-    state, system, T_i_j
-        Directed pairs (P,), the system of the poses, and its relative poses (P + priors, 4, 4).
+    state, poses, errors
+        Directed pairs (P,), and where they are linearised: (N, 4, 4) and (ERRORS,).
+    system, T_i_j
+        The system of the poses, and its relative poses (P + priors, 4, 4).
     H, g
         (P, 6 + ERRORS, 6 + ERRORS) and (P, 6 + ERRORS) normal equations of the pairs.
     factor
@@ -129,6 +179,8 @@ class Linearised:
     """
 
     state: pair_equations.DirectedPairs
+    poses: Float64
+    errors: Float64
     system: sparse.PairSystem
     T_i_j: Float64
     H: Float64
@@ -144,6 +196,7 @@ class Linearised:
         pairs: Intp,
         options: pair_equations.RefineOptions,
         priors: Priors,
+        errors: Float64 | None = None,
     ) -> Linearised:
         """Linearise views at refined poses.
 
@@ -152,18 +205,20 @@ class Linearised:
         views, options, priors
             As for `refine`.
         poses
-            (N, 4, 4) T_world_camera, refined without any error.
+            (N, 4, 4) T_world_camera, refined with these errors.
         pairs
             (M, 2) positions of views i < j.
+        errors
+            (ERRORS,) of the camera; None: without any.
         """
-        zero_errors, estimate_all = np.zeros(kernels.ERRORS), np.zeros(kernels.ERRORS, np.int64)
+        errors = np.zeros(kernels.ERRORS) if errors is None else errors
         stage = options.rounds[-1]
         state = pair_equations.DirectedPairs.of(views, pairs, options)
         system = priors.system(len(views), np.stack([state.target, state.source], 1))
-        state.evaluate(poses, zero_errors, np.ones_like(estimate_all), stage)
+        state.evaluate(poses, errors, np.ones(kernels.ERRORS, np.int64), stage)
         state.without_exposure()
         state.rescale(stage)
-        state.evaluate(poses, zero_errors, estimate_all, stage)
+        state.evaluate(poses, errors, _ESTIMATE_ALL, stage)
         H, g = state.without_exposure(range(kernels.ERRORS))
         i, j = system.pairs.T
         T_i_j = se3.inverse(poses[i]) @ poses[j]
@@ -179,12 +234,30 @@ class Linearised:
         # Reweighted least squares holds the weights constant, and their curvature exceeds that of
         # the cost. A single step with it falls short, and a sandwich estimate by it is too small
         # (Huber 1981, Robust Statistics, section 3.2: the mean of psi').
-        return cls(state, system, T_i_j, H, g, factor, tukey.consistency(projective.ROBUST))
+        curvature = tukey.consistency(projective.ROBUST)
+        return cls(state, poses, errors, system, T_i_j, H, g, factor, curvature)
 
     def response_to_errors(self) -> Response:
         """Return the response to each error that all views share."""
-        count = len(self.H)
-        return self._response([np.eye(kernels.ERRORS)[[k] * count] for k in range(_SHARED)])
+        return self._response(self._shared_errors())
+
+    def response_of_sections(self) -> Response:
+        """Return the same by sections of the images, if poses follow as by whole images."""
+        motion = self.response_to_errors().motion
+        step, follow = self._relative(self._initial_step()), list(map(self._relative, motion))
+        sections = [_sections(view.points) for view in self.state.views]
+        first, second = np.zeros((2, SECTIONS, len(follow)))
+        for row in range(SECTIONS):
+            part = self.state.with_points([np.flatnonzero(s == row) for s in sections])
+            part.evaluate(self.poses, self.errors, _ESTIMATE_ALL, self.state.options.rounds[-1])
+            equations = part.without_exposure(range(kernels.ERRORS))
+            for k, column in enumerate(self._shared_errors()):
+                of_pairs = _derivatives(*equations, column, step, follow[k])
+                first[row, k], second[row, k] = (x.sum() for x in of_pairs)
+        return Response(first, second * self.curvature, motion)
+
+    def _shared_errors(self) -> list[Float64]:
+        return [np.eye(kernels.ERRORS)[[k] * len(self.H)] for k in range(_SHARED)]
 
     def response_to_scales(self, profiles: Float64) -> Response:
         """Return the response to the scale of the depth by profiles (K, N) over the views."""
@@ -197,17 +270,8 @@ class Linearised:
 
     def _response(self, columns: Iterable[Float64]) -> Response:
         """Return the response to combinations (P, ERRORS) of the errors of each directed pair."""
-        state, H, g = self.state, self.H, self.g
-        A = se3.adjoint(se3.inverse(self.T_i_j[: len(H)]))
+        H, initial_motion = self.H, self._relative(self._initial_step())
         prior_rows = np.zeros((len(self.T_i_j) - len(H), 6))
-
-        def relative(step: Float64) -> Float64:
-            return step[state.source] - (A @ step[state.target][..., None])[..., 0]
-
-        initial_step = self.factor.step()
-        assert initial_step is not None, "the system is finite"
-        initial_motion = relative(initial_step)
-        slope = g[:, :6] + (H[:, :6, :6] @ initial_motion[..., None])[..., 0]
         first, second, motion = [], [], []
         for column in columns:
             mixed = (H[:, :6, 6:] @ column[..., None])[..., 0]
@@ -215,20 +279,23 @@ class Linearised:
             follow = self.factor.solve(gradient)
             assert follow is not None, "the system is finite"
             motion.append(follow)
-            relative_motion = relative(follow)
-            first.append(
-                (g[:, 6:] * column).sum(1)
-                + (mixed * initial_motion).sum(1)
-                + (slope * relative_motion).sum(1)
-            )
-            second.append(
-                np.einsum("mi,mij,mj->m", column, H[:, 6:, 6:], column)
-                + 2 * (mixed * relative_motion).sum(1)
-                + np.einsum("mi,mij,mj->m", relative_motion, H[:, :6, :6], relative_motion)
-            )
+            of_pairs = _derivatives(H, self.g, column, initial_motion, self._relative(follow))
+            first.append(of_pairs[0])
+            second.append(of_pairs[1])
         # Both directions of a pair together.
         by_pair = [np.array(x).reshape(len(x), 2, -1).sum(1).T for x in (first, second)]
         return Response(by_pair[0], by_pair[1] * self.curvature, np.array(motion))
+
+    def _initial_step(self) -> Float64:
+        step = self.factor.step()
+        assert step is not None, "the system is finite"
+        return step
+
+    def _relative(self, step: Float64) -> Float64:
+        """Return the motion (P, 6) of the relative poses by a step (N, 6)."""
+        source, target = self.state.source, self.state.target
+        A = se3.adjoint(se3.inverse(self.T_i_j[: len(source)]))
+        return np.asarray(step[source] - (A @ step[target][..., None])[..., 0], np.float64)
 
     def scale_scores(self, profiles: Float64) -> Float64:
         """Return (K,) how much scales by profiles (K, N) reduce the cost, for many profiles."""

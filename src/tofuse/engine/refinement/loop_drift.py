@@ -11,6 +11,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.joint_alignment import (
+    AlignedViews,
     RefinedViews,
     align_pairs,
     align_views,
@@ -187,8 +188,8 @@ class Loop:
         chain = np.stack([np.arange(i, j), np.arange(i + 1, j + 1)], 1)
         return np.concatenate([chain, [[i, j]]])
 
-    def error_by_views(self, steps: Float64, error_index: int, error: float) -> float:
-        """Return an error of the camera as all views of the loop estimate it, starting from one.
+    def estimate_by_views(self, steps: Float64, error_index: int, error: float) -> AlignedViews:
+        """Estimate an error of the camera by all views of the loop, starting from one.
 
         A true error is confirmed, even if residuals at a wrong one are small. An error that only
         closes the gap differs from the one that the views measure.
@@ -208,10 +209,9 @@ class Loop:
             of.views[self.i : self.j + 1], pairs[inside] - self.i, of.options
         )
         chain = np.array(_chained(steps))
-        aligned = align_views(
+        return align_views(
             views, chain, options, calibrate=[error_index], errors=errors, pairs=pairs
         )
-        return float(aligned.errors[error_index])
 
     def gap(self, before: Float64, after: Float64) -> Gap:
         """Return the gap, given steps aligned without and with errors of the camera."""

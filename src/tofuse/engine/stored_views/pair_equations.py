@@ -159,6 +159,11 @@ class DirectedPairs:
         """The exposures and scales of the pairs."""
         return KnownScales(self.target, self.source, np.stack(self._scales(), 1))
 
+    def with_points(self, which: Sequence[Intp]) -> DirectedPairs:
+        """Return the pairs with a part of the points of each view, yet to be evaluated."""
+        views = [view.with_points(kept) for view, kept in zip(self.views, which, strict=True)]
+        return replace(self, views=views, sources=_sources(views, by_patch=False))
+
     def put(self, which: Intp, subset: DirectedPairs) -> None:
         """Copy the exposure and scales of a subset into these pairs."""
         for scale, updated in zip(self._scales(), subset._scales(), strict=True):
