@@ -522,6 +522,10 @@ def test_calibration_without_loop_confirmation_is_noted() -> None:
     (text,) = warnings_of(UNDETERMINED)
     assert "does not determine the camera's focal length" in text
     assert text.endswith("allows for an error of 1 %. It would move the poses by 30 mm.")
+    # Another error is named where it would move the poses more, and limits the bound.
+    off_center = replace(UNDETERMINED, motion={"focal": (3.0, 0.2), "center_x": (5.0, 0.2)})
+    (text,) = warnings_of(off_center)
+    assert "principal point: the stated accuracy allows for an error of 1 % of the focal" in text
     small = Gap(2, 7, (0.006, 0.005), (0.006, 0.008))  # too small to tell
     assert warnings_of(replace(found, gap=small)) == warnings_of(found)
     gap = Gap(2, 7, (0.03, 0.02), (0.03, 0.02), 1.0, (0.03, 0.02))  # changed, not closed

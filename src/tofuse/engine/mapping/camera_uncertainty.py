@@ -27,19 +27,16 @@ def pose_errors(
 ) -> tuple[float, float]:
     """Return the rms of the pose errors (m, rad) due to the calibration.
 
-    Where the views don't determine the focal length, its error may be that of usual cameras. Added
-    are the uncertainty of corrections that were estimated from the views, and the gap of a loop
-    that a better calibration would close.
+    An error that the views don't determine may be that of usual cameras. Added are the uncertainty
+    of corrections that were estimated from the views, and the gap of a loop that a better
+    calibration would close.
     """
     credence_of_change = 1.0 if check.change_confirmed else _UNKNOWN
     errors = [
         _credence(check) * np.array(check.moved),
         credence_of_change * np.array(check.changed),
     ]
-    if check.undetermined:
-        errors.append(
-            _UNKNOWN * calibration_check.TOLERANCES["focal"] * np.array(check.motion["focal"])
-        )
+    errors += [_UNKNOWN * np.array(motion) for motion in check.undetermined.values()]
     if check.alarm and check.gap is not None:
         errors.append(np.array(check.gap.before))
     for part in corrections:

@@ -22,7 +22,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
-from tofuse.engine.quantities import percent
+from tofuse.engine.quantities import length, percent
 from tofuse.engine.refinement.camera_response import (
     SECTIONS,
     SIGNIFICANT,
@@ -55,6 +55,14 @@ TOLERANCES = {
     "center_x": 0.01,
     "center_y": 0.01,
     "distortion": 0.01,
+}
+# What they are errors of.
+QUANTITIES = {
+    "focal": "focal length",
+    "offset": "depth offset",
+    "center_x": "principal point",
+    "center_y": "principal point",
+    "distortion": "distortion",
 }
 # Errors that the drift over a loop can reveal; that by the others resembles any drift.
 _REVEALED_BY_LOOP = ("focal", "offset")
@@ -144,10 +152,13 @@ class CalibrationCheck:
     contradicted: bool = False
 
     @property
-    def undetermined(self) -> bool:
-        """Whether a wrong focal length would not show in this recording."""
-        sigma = np.inf if self.focal_sigma is None else self.focal_sigma
-        return bool(self.motion) and not _determined("focal", sigma)
+    def undetermined(self) -> dict[str, tuple[float, float]]:
+        """Errors that would not show in this recording, and the motion (m, rad) by a usual one."""
+        return {
+            name: (TOLERANCES[name] * m, TOLERANCES[name] * rad)
+            for name, (m, rad) in self.motion.items()
+            if not self.determines(name)
+        }
 
     def determines(self, name: str) -> bool:
         """Whether the views determine an error of the camera."""
@@ -443,7 +454,7 @@ def combine_checks(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:
         return alarms[len(alarms) // 2]
     without_alarm = [s for s in checks if not s.alarm]
     # One submap that determines the camera represents all of them.
-    without_alarm.sort(key=lambda s: (s.gap is None, s.undetermined))
+    without_alarm.sort(key=lambda s: (s.gap is None, "focal" in s.undetermined))
     return without_alarm[0] if without_alarm else CalibrationCheck()
 
 
@@ -533,6 +544,13 @@ def in_words(errors: Mapping[str, float]) -> list[str]:
         kind = "barrel" if errors["distortion"] > 0 else "pincushion"
         words.append(f"{percent(abs(errors['distortion']))} more {kind} distortion at 45 degrees")
     return words
+
+
+def usual_error(name: str) -> str:
+    """Describe the tolerance of an error in words."""
+    if name == "offset":
+        return length(TOLERANCES[name])
+    return percent(TOLERANCES[name]) + " of the focal length" * name.startswith("center")
 
 
 def proposal(errors: Mapping[str, float], best: str) -> str:

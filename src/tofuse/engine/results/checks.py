@@ -604,12 +604,15 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
     check = None if e.refinement is None else e.refinement.calibration_check
     if check is None or check.alarm or check.range_change is not None:
         return
-    if check.undetermined:
+    undetermined = check.undetermined
+    limits = undetermined and not check.unconfirmed and e.accuracy.limited_by == "calibration"
+    if "focal" in undetermined or limits:
+        name = max(undetermined, key=undetermined.__getitem__)
         text = (
-            "The recording does not determine the camera's focal length: the stated accuracy "
-            "allows for an error of 1 %."
+            f"The recording does not determine the camera's {calibration_check.QUANTITIES[name]}: "
+            f"the stated accuracy allows for an error of {calibration_check.usual_error(name)}."
         )
-        motion = length(0.01 * check.motion["focal"][0])
+        motion = length(undetermined[name][0])
         if motion != length(0.0):  # else the views give no estimate
             text += f" It would move the poses by {motion}."
     elif check.unconfirmed:
