@@ -247,9 +247,8 @@ def weigh(
 
     The arguments are those of `predict`.
 
-    A pixel tells little if a room behind a wrong plane has the same range: a floor is its own
-    reflection in all walls. In a mirror, surfaces that are illuminated directly, too, are nearer
-    than those of any room.
+    A pixel tells little if wrong planes predict its range as well: a floor is its own reflection in
+    all walls, and directly illuminated surfaces are seen at nearly the same range in any mirror.
     """
     seen = predict(opening, opening.plane, views, points, normals, noise)
     agrees = seen.coincides(noise)
@@ -268,16 +267,14 @@ def weigh(
             continue
         at = np.searchsorted(numbers, seen.pixels).clip(max=len(numbers) - 1)
         both = numbers[at] == seen.pixels
-        by_chance += both * other.is_room(noise)[first][at]
+        by_chance += both * other.coincides(noise)[first][at]
         compared += both
     chance = by_chance / compared
     explained = _EXPLAINED[:, None]
     ratios = np.log(np.where(agrees, (chance + explained * (1 - chance)) / chance, 1 - explained))
     # Of weak pixels, the mirror may explain less.
     total = sum(ratios[:, k].sum(1).max() for k in (seen.weak, ~seen.weak))
-    # The law by which two paths add up was chosen.
-    laws = np.log(len(_PERIODS_M)) if (seen.direct_share > 0).any() else 0.0
-    return Evidence(share, found * float(total) / len(seen) - float(laws), found)
+    return Evidence(share, found * float(total) / len(seen), found)
 
 
 def wrong_planes(opening: Opening, noise: Noise) -> list[Plane]:
