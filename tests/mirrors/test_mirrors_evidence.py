@@ -7,8 +7,8 @@ import pytest
 
 from tofuse.apps.mirrors.finding import _behind
 from tofuse.apps.mirrors.openings import Opening, Plane
-from tofuse.apps.mirrors.reflection import _shortened
-from tofuse.apps.mirrors.views import View, wrapped
+from tofuse.apps.mirrors.reflection import Evidence, _shortened, predict, weigh
+from tofuse.apps.mirrors.views import Noise, View, wrapped
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.geometry import se3
 
@@ -41,15 +41,105 @@ def test_ranges_are_known_up_to_the_ambiguity_range() -> None:
     np.testing.assert_allclose(wrapped(differences, np.inf), differences)
 
 
-def test_tilt_is_that_of_the_surface_around_the_opening() -> None:
+def _wall() -> tuple[np.ndarray, np.ndarray]:
     grid = np.stack(np.meshgrid(*[np.linspace(-0.7, 0.7, 41)] * 2), -1).reshape(-1, 2)
-    wall = np.c_[grid, 0.1 * grid[:, 0]]
-    normal = np.array([-0.1, 0.0, 1.0]) / np.hypot(0.1, 1.0)
-    normals = np.tile(normal, (len(wall), 1))
-    assert _OPENING.tilt_rad(wall, normals, 0.1) == pytest.approx(np.arctan(0.1), abs=1e-6)
+    wall = np.c_[grid, 0.05 * grid[:, 0]]
+    return wall, np.tile(np.array([-0.05, 0.0, 1.0]) / np.hypot(0.05, 1.0), (len(wall), 1))
+
+
+def test_tilt_is_that_of_the_surface_around_the_opening() -> None:
+    wall, normals = _wall()
+    assert _OPENING.tilt_rad(wall, normals, 0.1) == pytest.approx(np.arctan(0.05), abs=1e-6)
     # The surface in the opening itself says nothing.
     inside = _OPENING.contains(wall)
     assert np.isinf(_OPENING.tilt_rad(wall[inside], normals[inside], 0.1))
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.3, np.arctan(0.05)), (0.7, np.inf)])
+def test_furniture_before_a_wall_does_not_tilt_it(share: float, expected: float) -> None:
+    wall, normals = _wall()
+    furniture = np.random.default_rng(0).random(len(wall)) < share
+    normals[furniture] = (1.0, 0.0, 0.0)
+    assert _OPENING.tilt_rad(wall, normals, 0.1) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_camera_goes_through_a_door_but_not_through_a_mirror() -> None:
+    path = np.array([(2.0, 0.0, 1.0), (2.0, 0.0, -1.0), (0.2, 0.0, -1.0)])
+    assert not _OPENING.crossed_by(path)
+    assert _OPENING.crossed_by(np.concatenate([path, [(0.2, 0.0, 1.0)]]))
+
+
+_NOISE = Noise(0.02, 2.0, 0.0)
+
+
+def _room() -> tuple[np.ndarray, np.ndarray]:
+    """Return a bumpy wall opposite of the mirror, behind the camera, and its normals."""
+    grid = np.stack(np.meshgrid(*[np.linspace(-3.0, 3.0, 121)] * 2), -1).reshape(-1, 2)
+    wall = np.c_[grid, 3.0 + 0.4 * np.sin(3 * grid[:, 0]) + 0.3 * np.cos(4 * grid[:, 1])]
+    return wall, np.tile([0.0, 0.0, -1.0], (len(wall), 1))
+
+
+def _before_the_mirror(ranges: np.ndarray | float) -> View:
+    """A camera 1.5 m in front of the mirror that looks at it."""
+    T = se3.exp(np.array([0, 0, 0, np.pi, 0, 0]))
+    T[2, 3] = 1.5
+    camera = Pinhole(60, 60, 70.0, 70.0, 29.5, 29.5)
+    return View(camera, T, np.broadcast_to(ranges, (60, 60)).copy(), None, 0.6, np.inf)
+
+
+def _shown(share_on_plane: float) -> Evidence:
+    """Weigh what a mirror shows, with light from the glass in a share of the pixels."""
+    points, normals = _room()
+    view = _before_the_mirror(1.0)
+    images = _OPENING.plane.reflected(points)
+    rows, pixels = view.visible(images)
+    ranges = np.zeros((60, 60))
+    ranges[tuple(pixels.T)] = np.linalg.norm(images[rows] - view.origin, axis=1)
+    rays = view.camera.rays()
+    hidden = np.random.default_rng(0).random((60, 60)) < share_on_plane
+    ranges[hidden] = 1.5 * np.hypot(1, np.linalg.norm(rays, axis=-1))[hidden]
+    return weigh(_OPENING, [_before_the_mirror(ranges)] * 2, points, normals, _NOISE)
+
+
+def test_light_from_the_glass_itself_does_not_contradict_a_mirror() -> None:
+    hidden = _shown(0.8)
+    assert hidden.share > 0.9
+    assert hidden.log_ratio > 7
+
+
+def test_what_stands_before_a_mirror_hides_its_image() -> None:
+    points, normals = _room()
+    box = np.stack(np.meshgrid(*[np.linspace(-0.2, 0.2, 21)] * 2), -1).reshape(-1, 2)
+    box = np.c_[box, np.full(len(box), 0.5)]
+    view = _before_the_mirror(3.0)
+
+    def count(points: np.ndarray, normals: np.ndarray) -> int:
+        return len(predict(_OPENING, _OPENING.plane, [view], points, normals, _NOISE))
+
+    alone = count(points, normals)
+    with_box = np.r_[points, box], np.r_[normals, np.tile([0.0, 0.0, 1.0], (len(box), 1))]
+    assert 0 < count(*with_box) < 0.8 * alone
+
+
+@pytest.mark.parametrize("is_mirror", [True, False])
+@pytest.mark.parametrize("far_wall", [True, False])
+def test_a_room_like_the_reflection_has_no_second_path(is_mirror: bool, far_wall: bool) -> None:
+    """Side walls that the camera illuminates directly, too, as in an aisle, tell it."""
+    y, z = np.meshgrid(np.linspace(-0.45, 0.45, 61), np.linspace(0.1, 0.45, 41))
+    sides = [np.stack([side + 0 * y, y, z], -1).reshape(-1, 3) for side in (-0.45, 0.45)]
+    points = np.concatenate(sides)
+    normals = np.repeat([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], len(sides[0]), axis=0)
+    if far_wall:
+        points, normals = np.r_[points, _room()[0]], np.r_[normals, _room()[1]]
+    lamp = _before_the_mirror(4.0)
+    seen = predict(_OPENING, _OPENING.plane, [lamp], points, normals, _NOISE)
+    ranges = np.full(60 * 60, 4.0)
+    shorter = 0.5 * (seen.length - seen.direct)
+    ranges[seen.pixels] = seen.length - is_mirror * seen.direct_share * shorter
+    evidence = weigh(
+        _OPENING, [_before_the_mirror(ranges.reshape(60, 60))] * 2, points, normals, _NOISE
+    )
+    assert (evidence.log_ratio > 7) == is_mirror
 
 
 def _view_from_behind(range_m: float) -> View:

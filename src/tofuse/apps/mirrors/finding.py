@@ -47,12 +47,14 @@ def find_mirrors(recording: Recording, result: Reconstruction, seed: int = 0) ->
     planes = find_planes(points, normals, noise.tolerance_m, rng)
     chosen = rng.permutation(len(points))[:_POINTS]
     points, normals = points[chosen], normals[chosen]
+    path = result.trajectory[result.has_pose, :3, 3]
     found = []
     for plane in planes:
         weighed = [
             (opening, _weighed(opening, views, points, normals, noise))
             for opening in find_openings(plane, views, noise)
             if opening.tilt_rad(points, normals, 2 * noise.tolerance_m) < _MAX_TILT_RAD
+            and not opening.crossed_by(path)
         ]
         found += _mirrors_in(weighed)
     found.sort(key=lambda item: -item[1].log_ratio)

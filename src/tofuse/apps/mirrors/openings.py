@@ -131,12 +131,26 @@ class Opening:
         return bool(self.plane.height(view.origin) > margin) and bool(in_image.any())
 
     def tilt_rad(self, points: Float64, normals: Float64, margin: float) -> float:
-        """Angle between the plane and the surface (N, 3) around the opening that is in it."""
+        """Angle between the plane and the surface (N, 3) around the opening that is in it.
+
+        Infinite if most of what is there does not face the same way: the plane is no surface. Less
+        than half of it may be furniture in front.
+        """
         near = np.abs(self.plane.height(points)) < margin
         near[near] = self.grown(_RING_M).contains(points[near]) & ~self.contains(points[near])
-        mean = normals[near].sum(0)
-        length = np.linalg.norm(mean)
-        return float(np.arccos(mean @ self.plane.normal / length)) if length else np.inf
+        facing = normals[near] @ self.plane.normal > _MIN_COSINE
+        if facing.sum() <= 0.5 * len(facing):
+            return np.inf
+        mean = normals[near][facing].sum(0)
+        return float(np.arccos(min(1, mean @ self.plane.normal / np.linalg.norm(mean))))
+
+    def crossed_by(self, path: Float64) -> bool:
+        """Whether a camera that moves from each of the places (M, 3) to the next passes it."""
+        height = self.plane.height(path)
+        at = np.flatnonzero(height[:-1] * height[1:] < 0)
+        part = height[at] / (height[at] - height[at + 1])
+        places = path[at] + part[:, None] * (path[at + 1] - path[at])
+        return bool(self.contains(places).any())
 
     def joined(self, other: Opening) -> Opening:
         """Return the smallest convex opening of both, in this one's plane."""

@@ -43,8 +43,8 @@ class Prediction:
     ----------
     points
         (N, 3) of the model in front of the plane whose reflection is seen.
-    origins
-        (N, 3) of the camera.
+    length
+        (N,) distance from the camera to the image of the point, m.
     direct
         (N,) distance from the camera to the point, and the share of the light on that path.
     direct_share
@@ -58,7 +58,7 @@ class Prediction:
     """
 
     points: Float64
-    origins: Float64
+    length: Float64
     direct: Float64
     direct_share: Float64
     measured: Float64
@@ -69,15 +69,22 @@ class Prediction:
     def __len__(self) -> int:
         return len(self.points)
 
-    def coincides(self, plane: Plane, noise: Noise) -> Bool:
-        """Which of the measured ranges agree, with the mirror in this plane.
+    def is_room(self, noise: Noise) -> Bool:
+        """Which of the measured ranges agree, with a room in place of the image."""
+        off = wrapped(self.measured - self.length, self.ambiguity_m)
+        return np.abs(off) < self._tolerance(noise)
+
+    def _tolerance(self, noise: Noise) -> Float64:
+        return 2 * noise.tolerance_m * np.maximum(1, self.length / noise.range_m)
+
+    def coincides(self, noise: Noise) -> Bool:
+        """Which of the measured ranges agree, with a mirror.
 
         How the two paths add up depends on the camera: the law under which most ranges agree.
         """
-        by_mirror = np.linalg.norm(plane.reflected(self.points) - self.origins, axis=1)
-        shorter = 0.5 * (by_mirror - self.direct)
-        off = self.measured - by_mirror
-        tolerance = 2 * noise.tolerance_m * np.maximum(1, by_mirror / noise.range_m)
+        shorter = 0.5 * (self.length - self.direct)
+        off = self.measured - self.length
+        tolerance = self._tolerance(noise)
 
         def agree(rows: Int64, period_m: float) -> Bool:
             share, d = self.direct_share[rows], shorter[rows]
@@ -136,7 +143,7 @@ def predict(
     parts = [
         Prediction(
             points_of_none,
-            points_of_none,
+            none,
             none,
             none,
             none,
@@ -165,13 +172,17 @@ def _of_view(
     noise: Noise,
 ) -> Prediction:
     plane, origin = opening.plane, view.origin
-    rows, pixels = view.visible(phantom)
+    # What stands in front of the mirror hides what it shows.
+    rows, pixels = view.visible(np.concatenate([phantom, points]))
+    rows, pixels = rows[rows < len(phantom)], pixels[rows < len(phantom)]
     rays = phantom[rows] - origin
     length = np.linalg.norm(rays, axis=1)
     rays /= length[:, None]
     reached = plane.crossings(origin, rays)
     measured = view.at(view.ranges, pixels)
-    used = (measured > 0) & np.isfinite(reached)
+    # Glass and wall scatter light, too: a range of the plane itself tells nothing.
+    used = (measured > 0) & (np.abs(measured - reached) > 2 * noise.tolerance_m)
+    used &= np.isfinite(reached)
     weak = np.zeros(len(used), bool)
     if view.amplitude is not None:
         weak = view.at(view.amplitude, pixels) < noise.weakest
@@ -194,7 +205,7 @@ def _of_view(
     share = direct / np.maximum(direct + by_mirror, 1e-12)
     return Prediction(
         p[known],
-        np.tile(origin, (int(known.sum()), 1)),
+        length[known],
         distance[known],
         share[known],
         measured[known],
@@ -240,11 +251,13 @@ def weigh(
     all walls, and directly illuminated surfaces are seen at nearly the same range in any mirror.
     """
     seen = predict(opening, opening.plane, views, points, normals, noise)
-    agrees = seen.coincides(opening.plane, noise)
+    agrees = seen.coincides(noise)
     found = patches(seen)
-    strong = agrees[~seen.weak]
-    share = float(strong.mean()) if len(strong) else 0.0
-    if not compare or found < _MIN_PATCHES:
+    share = float(agrees.mean()) if len(seen) else 0.0
+    # A room that is the reflection of the one in front, as in an aisle of shelves, has no second
+    # path. It may fit a little better by chance: by a patch.
+    more = float(seen.is_room(noise).sum()) - float(agrees.sum())
+    if not compare or found < _MIN_PATCHES or found * more > len(seen):
         return Evidence(share, 0.0, found)
     by_chance, compared = np.full(len(seen), _CHANCE), np.ones(len(seen))
     for plane in wrong_planes(opening, noise):
@@ -254,7 +267,7 @@ def weigh(
             continue
         at = np.searchsorted(numbers, seen.pixels).clip(max=len(numbers) - 1)
         both = numbers[at] == seen.pixels
-        by_chance += both * other.coincides(plane, noise)[first][at]
+        by_chance += both * other.coincides(noise)[first][at]
         compared += both
     chance = by_chance / compared
     explained = _EXPLAINED[:, None]
