@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import pickle
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -318,3 +320,17 @@ def test_scans_that_are_not_read_are_named_with_a_remedy(tmp_path) -> None:
         for path in (folder, folder / name):
             with pytest.raises(InputError, match=remedy):
                 open_recording(path)
+
+
+def test_recording_pickled_for_another_process_is_opened_there(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", [1, 2, 3, 4])
+    selected = open_recording(folder, max_depth=3.5)[1::2]
+    copy = pickle.loads(pickle.dumps(selected))
+    assert str(copy) == str(selected)
+    assert [f.index for f in copy] == [1, 3]
+    assert [len(f) for f in copy] == [1200, 0]
+    # One of another source than was opened, or in memory, takes its frames along.
+    in_memory = ArraySource(list(selected))
+    for recording in (replace(selected, source=in_memory), Recording.of(in_memory, "it", "memory")):
+        found = pickle.loads(pickle.dumps(replace(recording, indices=np.array([0]))))
+        assert [f.index for f in found] == [1]
