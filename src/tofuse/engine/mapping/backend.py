@@ -237,6 +237,9 @@ class BackEnd:
         fused = model.fuse(
             dict(zip(ids, graph.poses, strict=True)), self._progress.advance, refinement.errors
         )
+        limit, count = self._config.fusion.faces, len(fused.mesh.faces) if fused.mesh else 0
+        if 0 < limit < count:
+            self._progress.note(f"{limit} triangles (faces) leave no surface: it has {count}")
         initial_poses = dict(zip(ids, closed.sequential, strict=True))
         return fused, model.sketch(initial_poses) if poses_changed and model.surface else None
 
