@@ -396,8 +396,15 @@ def _short_names(paths: list[Path]) -> list[str]:
     return names if len(set(names)) == len(names) else [str(p) for p in paths]
 
 
-def read_reference(path: str | Path) -> TimedPoses:
+def read_reference(path: str | Path, *, or_odometry: bool = False) -> TimedPoses:
     """Read reference poses from a trajectory file, or from a recording of any format.
+
+    Parameters
+    ----------
+    path
+        A file or folder.
+    or_odometry
+        Whether the odometry of a recording without reference poses will do.
 
     Raises
     ------
@@ -412,11 +419,15 @@ def read_reference(path: str | Path) -> TimedPoses:
         readers_of_poses = [lambda: open_recording(path), lambda: read_poses(path)]
     nothing = InputError("has no poses", where=path)
     found = reading.first_readable(readers_of_poses, lambda read: read(), nothing)
-    return found if isinstance(found, TimedPoses) else _reference_of(found, path)
+    if isinstance(found, TimedPoses):
+        return found
+    return _reference_of(found, path, or_odometry=or_odometry)
 
 
-def _reference_of(recording: Recording, path: Path) -> TimedPoses:
+def _reference_of(recording: Recording, path: Path, *, or_odometry: bool) -> TimedPoses:
     poses = recording.reference
+    if poses is None and or_odometry:
+        poses = recording.odometry
     if poses is None or not np.isfinite(poses).all((1, 2)).any():
         raise InputError(
             "has no reference poses",
