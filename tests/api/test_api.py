@@ -184,7 +184,7 @@ def test_mapper_states_each_pose_and_its_result_is_saved(arrays, tmp_path):
     error = se3.log(se3.inverse(arrays[2][-1]) @ pose)
     assert (np.abs(error) < 10 * sigmas[-1]).all()
     assert np.abs(error[:3]).max() < 0.02
-    blank = replace(recording[5], index=6, depth=np.zeros_like(recording[5].depth))
+    blank = replace(recording[5], index=6, timestamp=0.2, depth=np.zeros_like(recording[5].depth))
     assert mapper.push(blank) is None
     assert (mapper.last.status, mapper.last.covariance) == ("lost", None)
     found = mapper.finish()

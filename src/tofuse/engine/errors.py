@@ -97,7 +97,7 @@ class RegistrationError(TofuseError):
 
 
 class InputWarning(UserWarning):
-    """A file is read, but not exactly as it is."""
+    """A file is read, but not exactly as it is; or what is given may not be as it should."""
 
 
 class KernelCacheWarning(RuntimeWarning):
