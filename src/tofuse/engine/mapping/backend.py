@@ -191,8 +191,7 @@ class BackEnd:
         self._progress.stage("refining")
         # Elsewhere images alone: their errors are estimated from the result.
         steps = self._tracked.steps_at_degenerate(closed.sensors)
-        witness = closed.sensors.steps if closed.sensors.verified else ()
-        images = replace(closed.sensors, steps=steps, witness=witness)
+        images = replace(closed.sensors, steps=steps, witness=closed.sensors.steps)
         refinement = self._observations.refiner.finish(graph, images)
         if refinement.kept:
             graph = self._tracked.build(closed.loops, refinement, confirmed=closed.confirmed)
