@@ -61,7 +61,7 @@ def test_reconstruction_from_arrays_matches_reference(result):
 
 def test_result_changed_by_hand_is_not_saved(result, tmp_path) -> None:
     changed = tofuse.load(result.save(tmp_path / "out"))
-    with pytest.raises(OutputError, match=r"pass --overwrite \(Python: overwrite=True\)"):
+    with pytest.raises(OutputError, match=r"pass overwrite to replace it"):
         changed.save(tmp_path / "out")
     (tmp_path / "full").mkdir()
     (tmp_path / "full/notes.txt").touch()
@@ -184,7 +184,7 @@ def test_mapper_states_each_pose_and_its_result_is_saved(arrays, tmp_path):
     error = se3.log(se3.inverse(arrays[2][-1]) @ pose)
     assert (np.abs(error) < 10 * sigmas[-1]).all()
     assert np.abs(error[:3]).max() < 0.02
-    blank = replace(recording[5], index=6, depth=np.zeros_like(recording[5].depth))
+    blank = replace(recording[5], index=6, timestamp=0.2, depth=np.zeros_like(recording[5].depth))
     assert mapper.push(blank) is None
     assert (mapper.last.status, mapper.last.covariance) == ("lost", None)
     found = mapper.finish()
@@ -365,7 +365,7 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: tofuse.reconstruct(recording, prior="arkit"), "^prior: is 'arkit'"),
         (lambda: tofuse.Mapper(threads=0), "threads: is 0"),
         (lambda: tofuse.advise(None), "source: is a NoneType"),
-        (lambda: tofuse.open(tmp_path, min_depth="1m"), "min-depth: is '1m'"),
+        (lambda: tofuse.open(tmp_path, min_depth="1m"), "min_depth: is '1m'"),
         (lambda: tofuse.load(None), "folder: "),
         (lambda: result.save(None), "folder: "),
         (lambda: result.mesh.save(None), r"path: is a NoneType.*ends in one of \.glb"),

@@ -243,7 +243,7 @@ def test_depth_in_map_coordinates_needs_sensor(tmp_path, capsys) -> None:
     """Points are not measured from the origin of a map."""
     for k, points in enumerate((SOURCE, TARGET)):
         write(tmp_path / "in" / f"{k}.xyz", points + MAP)
-    with pytest.raises(tofuse.InputError, match=r"frame 0: is in map coordinates.*--max-depth"):
+    with pytest.raises(tofuse.InputError, match=r"frame 0: is in map coordinates.*max_depth"):
         tofuse.open(tmp_path / "in", max_depth=5.0)[0]
     arguments = ["run", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--max-depth", "5"]
     assert main(arguments) == 2

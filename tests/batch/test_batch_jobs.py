@@ -69,7 +69,7 @@ def test_table_sets_options_per_job(recordings: Path) -> None:
         ("list.csv", "recording,evry\na,2\n", "for a table; did you mean every?"),
         ("list.csv", "recording,out\na,b\n", "row 1: out is not an option"),
         ("list.csv", "recording,threads\na,1\n", "row 1: threads is not an option"),
-        ("list.csv", "recording,every\na,none\n", "row 1: argument --every: 'none' is not"),
+        ("list.csv", "recording,every\na,none\n", "row 1: argument every: 'none' is not"),
         ("list.csv", "recording,object\na,perhaps\n", "row 1: object is 'perhaps'; use yes or no"),
         ("list.csv", "recording,name\na,../b\n", "row 1: '../b' can't be used as the name"),
         ("list.csv", "recording,name\na,jobs\n", "row 1: 'jobs' can't be used as the name"),

@@ -177,7 +177,7 @@ def test_foreign_result_is_not_replaced(folder: BatchFolder) -> None:
     (strange / ".tofuse-unfinished").mkdir()  # from a killed run
     assert pending(JOBS, folder, overwrite=False) == list(JOBS)
     (strange / "run.json").write_text("{}")
-    with pytest.raises(OutputError, match="pass --overwrite"):
+    with pytest.raises(OutputError, match="pass overwrite"):
         pending(JOBS, folder, overwrite=False)
 
 

@@ -106,6 +106,11 @@ def test_two_results_are_compared_by_their_sigmas(tmp_path: Path) -> None:
     card = make_card(pair)
     assert card.changed == ["focal"]
     assert card.drifts["focal"].change is None
+    # Nothing is known of time.
+    assert card.sentence == (
+        "Drift, or unlike places: the focal length differs between the results."
+    )
+    assert [row[-1] for row in card.rows if row[0] == "Focal length"] == ["differs"]
     assert any("twice their sigmas" in warning for warning in card.warnings)
 
 

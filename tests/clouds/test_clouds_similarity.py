@@ -69,5 +69,5 @@ def test_map_coordinates_and_repetition():
 def test_scale_takes_neither_guess_nor_method():
     points = stone(500, 0)
     for options in ({"guess": np.eye(4)}, {"method": "icp"}):
-        with pytest.raises(tofuse.InputError, match="does not apply to --scale; leave one out"):
+        with pytest.raises(tofuse.InputError, match="does not apply to scale; leave one out"):
             tofuse.register(points, points, scale=True, **options)

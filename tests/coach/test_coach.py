@@ -199,3 +199,10 @@ def test_mapper_and_its_result_are_advised(room_recording) -> None:
     for said in (live, done):
         assert 0 < said.expected_m <= said.bound_m
         assert said.words
+
+
+def test_words_of_times_and_of_the_same_view() -> None:
+    assert [module._ago(s) for s in (0.21, 1.2, 75)] == ["0.2 s ago", "1 s ago", "75 s ago"]
+    known, _ = known_turn([0.0, 40, 80, 120, 160, 200])
+    assert module._way_to(known, 5, known.poses[5])[1] == "stay here"
+    assert module._way_to(known, 0, known.poses[0])[1].startswith("go to where you were 5 s ago")

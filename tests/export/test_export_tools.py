@@ -118,7 +118,7 @@ def test_evidence_of_views_adds_up() -> None:
     assert grid.states[(*cell[:2], cell[2] + 5)] == FREE
     assert grid.log_odds.min() == np.float32(-2.0)
     grid.add(np.zeros((0, 3)), np.zeros(3), 12)
-    with pytest.raises(InputError, match=r"--voxel: of 0\.001 m makes 16060 million voxels"):
+    with pytest.raises(InputError, match=r"voxel: of 0\.001 m makes 16060 million voxels"):
         OccupancyGrid.around(corners, 0.001)
 
 

@@ -156,4 +156,4 @@ def test_invalid_scenes_are_refused(scene: Callable[[int], np.ndarray], why: str
     frames = [frame(scene(k) + rng.normal(0, 0.004, (ROWS, COLUMNS)), k) for k in range(16)]
     with pytest.raises(InputError, match=why) as caught:
         moving_object(frames)
-    assert "--max-depth" in str(caught.value)
+    assert "max_depth" in str(caught.value)

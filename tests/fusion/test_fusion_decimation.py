@@ -9,6 +9,7 @@ import pytest
 
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.mesh import Mesh, collapse_edges
+from tofuse.engine.fusion.model import at_most
 from tofuse.engine.geometry.kdtree import KdTree
 from tofuse.lab.experiments.surface_error import Surface, distances
 
@@ -184,3 +185,6 @@ def test_too_few_triangles_for_a_surface_are_refused() -> None:
     pieces = [replace(piece, vertices=(piece.vertices + d).astype(np.float32)) for d in offsets]
     with pytest.raises(InputError, match="3 are too few for the surface: none is left"):
         together(*pieces).decimated(3)
+    # A run, which has made the surface by then, keeps the fewest that leave some.
+    assert 3 < len(at_most(together(*pieces), 3).faces) < 100
+    assert len(at_most(together(*pieces), 0).faces) == 8 * len(piece.faces)

@@ -20,6 +20,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.progress import Silent
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.formats.poses.trajectory import write_tum
+from tofuse.formats.recordings import read_reference
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import simulate
 
@@ -215,6 +216,17 @@ def tofuse_ply(path, points) -> None:
 
 
 @pytest.mark.nightly_part
+def test_odometry_of_recording_is_judged_where_it_has_no_reference(room_recording, tmp_path):
+    folder = tmp_path / "recording"
+    shutil.copytree(room_recording, folder)
+    (folder / "groundtruth.txt").rename(folder / "odometry.txt")
+    recording = tofuse.open(folder)
+    assert recording.reference is None
+    np.testing.assert_allclose(poses_for(recording, folder), recording.odometry, atol=1e-6)
+    with pytest.raises(InputError, match="has no reference poses"):
+        read_reference(folder)
+
+
 def test_command(room_recording, truth, tmp_path, capsys) -> None:
     recording = tofuse.open(room_recording)
     poses = tmp_path / "poses.txt"

@@ -78,7 +78,7 @@ def test_realsense_errors_are_reported(install: Install) -> None:
     package.plugged_in = False
     with pytest.raises(DeviceError, match="no camera is connected"):
         device_named("realsense", {}).open()
-    with pytest.raises(DeviceError, match=r"no camera f999 is connected; .* --set serial="):
+    with pytest.raises(DeviceError, match=r"no camera f999 is connected; .* set serial="):
         device_named("realsense", {"serial": "f999"}).open()
 
 

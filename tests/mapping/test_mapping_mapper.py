@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import shutil
+import warnings
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -10,7 +12,7 @@ import numpy as np
 import pytest
 
 import tofuse
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, InputWarning
 from tofuse.engine.filters.base import Filter
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
@@ -18,6 +20,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import Optimisation, Optimiser
 from tofuse.engine.loops.loops import PriorLoop
 from tofuse.engine.mapping.config import changed
+from tofuse.engine.mapping.frame_log import FrameSequence
 from tofuse.engine.mapping.mapper import Mapper
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
@@ -81,6 +84,39 @@ def test_camera_may_reuse_its_arrays(frames) -> None:
     kept_cloud, reused_cloud = kept.finish().cloud, reused.finish().cloud
     np.testing.assert_array_equal(kept_cloud.points, reused_cloud.points)
     np.testing.assert_array_equal(kept_cloud.color, reused_cloud.color)
+
+
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        ([0.1, 0.2, 0.2, 0.1, 0.4], [r"frame 2: timestamp is 0\.2, after 0\.2"]),
+        ([1e9, 0.2, 0.3], [r"frame 1: timestamp is 0\.2, after 1000000000"]),
+        ([1e18, 1e18 + 33_000_000], ["frame 1: .* camera in ns"]),
+        (np.arange(1, 7) * 33.3, ["frame 4: .* camera in ms"]),
+        ([0.0, 0.1, 30, 30.1, 400], []),
+        ([0.0, 0.0, 0.0], []),
+    ],
+)
+def test_timestamps_of_live_frames_are_checked(frames, times, said) -> None:
+    live = FrameSequence()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for k, time in enumerate(times):
+            live.check_time(replace(frames[0], index=k, timestamp=float(time)))
+    assert [w.category for w in caught] == [InputWarning] * len(said)
+    assert all(re.search(text, str(w.message)) for text, w in zip(said, caught, strict=True))
+
+
+def test_live_frames_are_mapped_whatever_their_times(frames) -> None:
+    mapper = Mapper(CONFIG)
+    same_time = [replace(frame, timestamp=5.0) for frame in frames[:3]]
+    mapper.push(same_time[0])
+    with pytest.warns(InputWarning, match="pass seconds that ascend") as caught:
+        mapper.push(same_time[1])
+    mapper.push(same_time[2])
+    assert [w.filename for w in caught] == [__file__]
+    assert mapper.last is not None
+    assert mapper.last.status == "tracked"
 
 
 def test_result_of_whole_run(whole, recording) -> None:

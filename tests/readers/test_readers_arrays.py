@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,12 @@ def test_dates_are_converted_to_seconds() -> None:
     recording = tofuse.from_arrays(np.ones((3, 48, 64)), K, timestamps=times)
     np.testing.assert_allclose(np.diff(recording.timestamps), 0.04, atol=1e-6)
     assert recording.timestamps[0] == 1704067200
+    zone = timezone(timedelta(hours=2))
+    for begin in (datetime(2024, 1, 1), datetime(2024, 1, 1, 2, tzinfo=zone), timedelta(0)):
+        dates = [begin + timedelta(milliseconds=40 * k) for k in range(3)]
+        python = tofuse.from_arrays(np.ones((3, 48, 64)), K, timestamps=dates)
+        np.testing.assert_allclose(np.diff(python.timestamps), 0.04, atol=1e-6)
+        assert python.timestamps[0] == (0 if begin == timedelta(0) else 1704067200)
 
 
 @pytest.mark.parametrize("order", "<>")

@@ -131,11 +131,11 @@ def with_fewer_poses(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (without_camera, r"room0: has no cam_params\.json, nor has the folder above; .* --camera"),
+        (without_camera, r"room0: has no cam_params\.json, nor has the folder above; .* camera"),
         (of_other_size, r"depth000000\.png: is 64 x 48 pixels, .* 1200 x 48"),
         (
             without_scale,
-            r"cam_params\.json: camera: scale: is missing; correct it there, or use --",
+            r"cam_params\.json: camera: scale: is missing; correct it there, or use camera",
         ),
         (in_metres, r"cam_params\.json: scale: is 0\.001, which are no counts"),
         (with_fewer_poses, r"traj\.txt: has 2 lines of 16 numbers"),
@@ -155,7 +155,7 @@ def test_pairs(tmp_path: Path, names: tuple[str, str]) -> None:
     made.make_pairs(tmp_path / "scene_01", *names)
     check(open_recording(tmp_path / "scene_01"), "pairs")
     camera = (tmp_path / "scene_01" / "camera.json").rename(tmp_path / "camera.json")
-    with pytest.raises(InputError, match=r"use --format pairs with --camera camera\.json, which s"):
+    with pytest.raises(InputError, match=r"use format pairs with camera=camera\.json, which s"):
         open_recording(tmp_path / "scene_01")
     with pytest.raises(InputError, match="neither lens nor unit"):
         open_recording(tmp_path / "scene_01", format="pairs")

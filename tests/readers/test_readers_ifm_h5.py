@@ -35,7 +35,7 @@ def test_h5_matches_stream_of_head(tmp_path: Path, model: int) -> None:
 def test_one_of_several_heads_is_chosen(tmp_path: Path) -> None:
     made.make_h5(tmp_path / "a.h5", heads=2)
     recording = open_recording(tmp_path / "a.h5")
-    assert any("others are o3r_tof_1: choose with --topic" in w for w in recording.warnings)
+    assert any("others are o3r_tof_1: choose with topic" in w for w in recording.warnings)
     other = open_recording(tmp_path / "a.h5", topic="o3r_tof_1")
     a, b = recording[0], other[0]
     np.testing.assert_allclose(b.depth, a.depth / 2, atol=made.UNIT)

@@ -240,7 +240,7 @@ DAMAGED: list[tuple[str, Change, str | tuple[int, ...], str]] = [
     ("arducam", drop("camera.json"), REFUSED, "contain neither lens nor unit"),
     ("arducam", drop("confidence_*0103.raw"), (), "frames have no confidence"),
     ("arducam", put("depth_33_24_f32_1700000009000.raw", bytes(4 * 33 * 24)), (3,), "is 33 x 24"),
-    ("aditof", adi(adi_frame(0, points=False)), REFUSED, "pass the lens with --camera"),
+    ("aditof", adi(adi_frame(0, points=False)), REFUSED, "pass the lens with camera"),
     ("aditof", longer_points, REFUSED, "not at the depth along the rays"),
     ("aditof", adi(adi_frame(0), adi_frame(1, lens=SMALL)), (1,), "is 32 x 24 pixels"),
     ("aditof", cut(5), (), "is cut off or damaged: its end is left out"),

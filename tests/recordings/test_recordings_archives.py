@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import made_phones as made
+from tofuse.apps.cli.program import main
 from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.formats.recordings.archives import unzipped
@@ -175,3 +176,12 @@ def test_unsafe_archive_is_refused_in_one_line(make, problem: str, tmp_path: Pat
     assert "\n" not in str(error.value)
     assert str(path) in str(error.value)
     assert not (tmp_path.parent / "outside.txt").exists()
+
+
+def test_report_has_the_name_of_the_scan_without_that_of_the_archive(tmp_path: Path) -> None:
+    made.make_scanner_app(tmp_path / "scan")
+    (tmp_path / "scan/conf_00000.png").unlink()
+    path = zipped(tmp_path / "scan", tmp_path / "my chair.ZIP")
+    main(["run", str(path), "--out", str(tmp_path / "out"), "--threads", "1"])
+    assert "<title>my chair" in (tmp_path / "out/report.html").read_text(encoding="utf-8")
+    assert "no confidence image for 1 frame" in open_recording(path).warnings

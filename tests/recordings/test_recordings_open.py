@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import pickle
+import re
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -10,7 +13,7 @@ import pytest
 
 from made_phones import make_scanner_app
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.errors import InputError, UnreadableFrameError, on_command_line
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.fusion.geometry_record import GeometryRecord
@@ -94,7 +97,7 @@ def test_folder_with_single_recording_stands_for_it(tmp_path: Path) -> None:
     (tmp_path / "3rscan").mkdir()
     write_ply(tmp_path / "3rscan" / "mesh.ply", GeometryRecord(np.ones((3, 3))))
     make_scanner_app(tmp_path / "3rscan" / "sequence")
-    with pytest.raises(InputError, match=r"and a recording in sequence/; pass .*--format ply"):
+    with pytest.raises(InputError, match=r"and a recording in sequence/; pass .*format ply"):
         open_recording(tmp_path / "3rscan")
     assert open_recording(tmp_path / "3rscan", format="ply").format == "ply"
     assert len(open_recording(tmp_path / "3rscan", format="3dscannerapp")) == 3
@@ -117,7 +120,7 @@ def test_recordings_of_different_formats_are_not_joined_by_default(tmp_path: Pat
 def test_ambiguous_format_is_refused(tmp_path: Path) -> None:
     write_ply(tmp_path / "0.ply", GeometryRecord(np.ones((3, 3))))
     (tmp_path / "0.xyz").write_text("1 2 3\n")
-    with pytest.raises(InputError, match="--format ply or xyz"):
+    with pytest.raises(InputError, match="format ply or xyz"):
         open_recording(tmp_path)
     assert open_recording(tmp_path, format="xyz").format == "xyz"
 
@@ -132,7 +135,7 @@ def test_cloud_beside_native_recording_is_ignored(tmp_path: Path) -> None:
 def test_images_without_a_camera(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", [1])
     (folder / "camera.json").rename(tmp_path / "camera.json")
-    with pytest.raises(InputError, match=r"depth/ but no camera\.json.*--camera"):
+    with pytest.raises(InputError, match=r"depth/ but no camera\.json.*camera"):
         open_recording(folder)
     camera = tmp_path / "camera.json"
     assert depths(open_recording(folder, format="native", camera=camera)) == [1]
@@ -318,3 +321,35 @@ def test_scans_that_are_not_read_are_named_with_a_remedy(tmp_path) -> None:
         for path in (folder, folder / name):
             with pytest.raises(InputError, match=remedy):
                 open_recording(path)
+
+
+def test_recording_pickled_for_another_process_is_opened_there(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", [1, 2, 3, 4])
+    selected = open_recording(folder, max_depth=3.5)[1::2]
+    copy = pickle.loads(pickle.dumps(selected))
+    assert str(copy) == str(selected)
+    assert [f.index for f in copy] == [1, 3]
+    assert [len(f) for f in copy] == [1200, 0]
+    # One of another source than was opened, or in memory, takes its frames along.
+    in_memory = ArraySource(list(selected))
+    for recording in (replace(selected, source=in_memory), Recording.of(in_memory, "it", "memory")):
+        found = pickle.loads(pickle.dumps(replace(recording, indices=np.array([0]))))
+        assert [f.index for f in found] == [1]
+
+
+def test_messages_name_arguments_in_python_and_options_on_the_command_line(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a --format", [1])
+    for arguments, option in (
+        ({"format": "magic"}, "--format"),
+        ({"min_depth": 2.0, "max_depth": 1.0}, "--min-depth, --max-depth"),
+    ):
+        with pytest.raises(InputError) as python:
+            open_recording(folder, **arguments)
+        assert python.value.where == ", ".join(arguments)
+        with on_command_line(), pytest.raises(InputError) as typed:
+            open_recording(folder, **arguments)
+        assert typed.value.where == option
+    (folder / "depth" / "000000.png").rename(folder / "0.png")
+    (folder / "camera.json").unlink()
+    with pytest.raises(InputError, match=f"{re.escape(str(folder))}: .* or use format "):
+        open_recording(folder)

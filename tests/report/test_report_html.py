@@ -225,6 +225,11 @@ def test_reasons_name_their_frames(tmp_path):
     assert "Surfaces do not agree (frames 3-4, 20-34, 50)." in text_of_verdict
 
 
+def test_summary_of_a_single_image_speaks_of_no_parts(tmp_path):
+    summary = page(tmp_path, lonely(verdict="degraded"), ReportExtras("x")).sections["summary"]
+    assert "deep, and was seen by a single image." in " ".join(summary.split())
+
+
 def test_summary_names_the_fault_of_the_recording(tmp_path):
     text = "The median depth is 11 m. Check depth_unit_m."
     result = lonely(verdict="degraded", reasons=(Reason("faulty_recording", ((0, 0),), text),))

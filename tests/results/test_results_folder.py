@@ -145,7 +145,7 @@ def test_interrupted_replacement_is_finished(tmp_path, monkeypatch, by, meanwhil
     else:
         if meanwhile == "an empty folder":
             out.mkdir()
-        with pytest.raises(OutputError, match="contains an earlier result; pass --overwrite"):
+        with pytest.raises(OutputError, match="contains an earlier result; pass overwrite"):
             OutputFolder(out)
     assert is_result(out)
     assert read_run_json(out / "run.json")["seed"] == 2

@@ -44,7 +44,7 @@ def test_new_folder_and_its_parents_are_made(tmp_path) -> None:
 def test_earlier_result_is_replaced_only_on_request(tmp_path) -> None:
     write_result(result(), OutputFolder(tmp_path))
     before = contents(tmp_path)
-    with pytest.raises(OutputError, match="contains an earlier result; pass --overwrite"):
+    with pytest.raises(OutputError, match="contains an earlier result; pass overwrite"):
         OutputFolder(tmp_path)
     assert contents(tmp_path) == before
     write_result(result(seed=5), OutputFolder(tmp_path, overwrite=True))

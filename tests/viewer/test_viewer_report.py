@@ -68,7 +68,7 @@ def made(tmp_path_factory):
 def test_result_without_report_is_refused(made, tmp_path) -> None:
     shutil.copytree(made[1], tmp_path / "out")
     (tmp_path / "out" / "report.html").unlink()
-    with pytest.raises(InputError, match=r"has no report\.html; run again without --no-report"):
+    with pytest.raises(InputError, match=r"has no report\.html; run again without no_report"):
         report_pages(tmp_path / "out")
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import errno
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 _MAX_LENGTH = 600  # maximum characters of a problem: text quoted from a file may have any length
@@ -12,11 +15,41 @@ _MAX_LENGTH = 600  # maximum characters of a problem: text quoted from a file ma
 SHOWN_AS: dict[str, str] = {}
 
 
+# Messages name options as on the command line, which are arguments in Python; not in paths. A
+# value is the name of a file.
+_OPTION = re.compile(r"(?<![\w/\\.-])--([a-z][a-z-]*)\b(?: (?=\w+\.json\b))?")
+_on_command_line = False
+
+
+@contextmanager
+def on_command_line() -> Iterator[None]:
+    """Let messages name options as they are typed, instead of arguments in Python."""
+    global _on_command_line
+    before, _on_command_line = _on_command_line, True
+    try:
+        yield
+    finally:
+        _on_command_line = before
+
+
 def shown(text: str) -> str:
-    """Return a message for the user, without the names of temporary folders."""
+    """Return a message for the user, without temporary folders, and with options as named there.
+
+    >>> shown("use --min-depth, or --camera camera.json")
+    'use min_depth, or camera=camera.json'
+    """
+    text = _without_temporary(text)
+    return text if _on_command_line else _OPTION.sub(_argument, text)
+
+
+def _without_temporary(text: str) -> str:
     for folder, path in list(SHOWN_AS.items()):  # another thread may add one
         text = text.replace(folder, path)
     return text
+
+
+def _argument(option: re.Match[str]) -> str:
+    return option[1].replace("-", "_") + ("=" if option[0].endswith(" ") else "")
 
 
 def _clipped(text: str) -> str:
@@ -30,7 +63,9 @@ class TofuseError(Exception):
         self, problem: str, *, where: str | Path | None = None, remedy: str | None = None
     ) -> None:
         self.problem = _clipped(shown(problem))
-        self.where = None if where is None else shown(str(where))
+        place = "" if where is None else str(where)
+        # A path may look as if it had an option in it.
+        self.where = (shown if place.startswith("--") else _without_temporary)(place) or None
         self.remedy = None if remedy is None else shown(remedy)
         parts = [f"{_clipped(self.where)}: " if self.where else "", self.problem]
         parts += [f"; {_clipped(self.remedy)}"] if self.remedy else []
@@ -62,7 +97,7 @@ class RegistrationError(TofuseError):
 
 
 class InputWarning(UserWarning):
-    """A file is read, but not exactly as it is."""
+    """A file is read, but not exactly as it is; or what is given may not be as it should."""
 
 
 class KernelCacheWarning(RuntimeWarning):

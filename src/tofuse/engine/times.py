@@ -1,4 +1,4 @@
-"""Timestamps of different sensors: which belong together."""
+"""Timestamps: whether they are in seconds, and which of different sensors belong together."""
 
 from __future__ import annotations
 
@@ -6,8 +6,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.errors import InputError
 
 MAX_GAP_S = 0.02  # between a frame and its pose
+# Longest median interval of frames, s; also for a camera that runs freely: most intervals, up to
+# these percentiles, differ by less than this factor. And units that are mistaken for seconds.
+_MAX_INTERVAL_S, _MAX_REGULAR_INTERVAL_S = 1000.0, 5.0
+_MOST, _REGULAR_RATIO, _MIN_INTERVALS = (12.5, 50.0, 87.5), 1.5, 4
+_UNITS = {"ms": 1e3, "us": 1e6, "ns": 1e9}
 
 
 def nearest(times: ArrayLike, queries: ArrayLike, limit: float = np.inf) -> Intp:
@@ -64,3 +70,17 @@ def associate(times_a: ArrayLike, times_b: ArrayLike, limit: float = MAX_GAP_S) 
         i, j = i[~mutual], np.delete(j, partner[mutual])
     pairs = np.concatenate(found)
     return pairs[np.lexsort((pairs[:, 0], a[pairs[:, 0]]))]
+
+
+def check_seconds(times: Float64) -> None:
+    """Raise InputError if the intervals of times (N,), N > 1, are a camera's in another unit."""
+    steps = np.diff(times)
+    low, interval, high = np.percentile(steps, _MOST)
+    is_regular = len(steps) >= _MIN_INTERVALS and high < _REGULAR_RATIO * low
+    if interval > (_MAX_REGULAR_INTERVAL_S if is_regular else _MAX_INTERVAL_S):
+        unit = next((name for name, factor in _UNITS.items() if interval < factor), "ns")
+        raise InputError(
+            f"have a median interval of {interval:.4g}, which is that of a camera in {unit}",
+            where="timestamps",
+            remedy=f"divide them by {_UNITS[unit]:.0e}, or use timedelta64, which states its unit",
+        )

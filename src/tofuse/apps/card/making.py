@@ -85,10 +85,10 @@ class Card:
             return "Nothing can be tested: no quantity is stated by two results."
         if self.changed:
             labels = " and ".join(QUANTITIES[name].label.lower() for name in self.changed)
-            alone = len(self.changed) == 1
-            return (
-                f"Drift: the {labels} of this camera {'changes' if alone else 'change'} with time."
-            )
+            s = "s" if len(self.changed) == 1 else ""
+            if any(self.drifts[name].change is not None for name in self.changed):
+                return f"Drift: the {labels} of this camera change{s} with time."
+            return f"Drift, or unlike places: the {labels} differ{s} between the results."
         return "No drift: no quantity changes with time by more than its uncertainty."
 
     @property
@@ -100,7 +100,8 @@ class Card:
             mean = quantity.text(drift.mean, drift.sigma)
             change = quantity.text(drift.change, drift.change_sigma)
             scatter, p = f"{drift.scatter:.1f}", f"{drift.p:.3f}"
-            changes = "changes" if name in self.changed else "–"
+            changes = "differs" if drift.change is None else "changes"
+            changes = changes if name in self.changed else "–"
             rows.append((quantity.label, mean, scatter, change, p, changes))
         return rows
 

@@ -240,9 +240,9 @@ def _run_unwrapped(command: Callable[[], int]) -> int:
 def run_command(command: Callable[[], int]) -> int:
     """Return the exit status of a command; errors are printed in one line."""
     from tofuse.apps.cli.streams import safe_streams
-    from tofuse.engine.errors import Ended, TofuseError
+    from tofuse.engine.errors import Ended, TofuseError, on_command_line
 
-    with safe_streams():
+    with safe_streams(), on_command_line():
         try:
             return _run_unwrapped(command)
         except TofuseError as error:

@@ -123,7 +123,7 @@ def best(known: Known, within_s: float = np.inf) -> Advice:
     if not np.isfinite(bound_m):
         gain = f"{100 * (1 - factor):.0f} % less uncertain"
         if len(known.gaps):
-            gain += f", but nothing bounds the motion {known.ages_s[known.gaps[-1]]:.0f} s ago"
+            gain += f", but nothing bounds the motion {_ago(known.ages_s[known.gaps[-1]])}"
     elif before == after:
         return Advice(bound_m, bound_m, f"go on: no look back would lower the {before}")
     pose = poses[move.way[-1]].copy()
@@ -178,10 +178,11 @@ def _way_to(known: Known, k: int, target: Float64) -> tuple[Float64, str, float]
     now, reach = known.poses[-1], known.surfaces.reach_m
     motion = se3.inverse(now) @ target
     step, angle = float(np.linalg.norm(motion[:3, 3])), float(se3.angle(motion))
-    seconds = f"{known.ages_s[k]:.0f} s ago"
+    seconds = _ago(known.ages_s[k])
     looks = int(np.clip(np.ceil(max(angle / _STEP_ANGLE, step / reach / _STEP)), 1, _MAX_LOOKS))
     if step < _SAME_PLACE * reach:
-        words = f"{_turn(*_direction(motion[:3, 2]))}, to what you saw {seconds}"
+        turn = _turn(*_direction(motion[:3, 2]))
+        words = f"{turn}, to what you saw {seconds}" if turn else "stay here"
     else:
         words = f"go to where you were {seconds}, {_way(motion[:3, 3])}"
     effort = step / reach + angle
@@ -211,7 +212,7 @@ def _direction(v: Float64) -> tuple[float, float]:
 
 
 def _turn(yaw: float, pitch: float) -> str:
-    """Return words for a turn by degrees to the right and upwards."""
+    """Return words for a turn by degrees to the right and upwards; none for a small one."""
     parts = []
     if abs(yaw) > _SMALL_DEGREES:
         side = "right" if yaw > 0 else "left"
@@ -220,7 +221,11 @@ def _turn(yaw: float, pitch: float) -> str:
         )
     if abs(pitch) > _SMALL_DEGREES:
         parts.append(f"look {_tens(pitch)}\N{DEGREE SIGN} {'up' if pitch > 0 else 'down'}")
-    return " and ".join(parts) or "stay here"
+    return " and ".join(parts)
+
+
+def _ago(seconds: float) -> str:
+    return f"{seconds:.0f} s ago" if seconds >= 1 else f"{seconds:.1f} s ago"
 
 
 def _way(step: Float64) -> str:

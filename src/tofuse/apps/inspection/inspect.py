@@ -20,7 +20,7 @@ from tofuse.engine.cameras import Pinhole, RayTable
 from tofuse.engine.errors import InputError, shown
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.noise import family_of
-from tofuse.engine.quantities import percent
+from tofuse.engine.quantities import count, percent
 from tofuse.formats.recordings import open_recording
 from tofuse.formats.rigs import check_one_camera
 
@@ -148,7 +148,7 @@ def _facts(recording: Recording, frames: Sequence[Frame]) -> dict[str, str]:
     stored = {"reference poses": recording.reference, "odometry": recording.odometry}
     for name, poses in stored.items():
         known = 0 if poses is None else int(np.isfinite(poses[:, 0, 0]).sum())
-        facts[name] = "none" if poses is None else f"for {known} frames"
+        facts[name] = "none" if poses is None else f"for {count(known, 'frame')}"
     return facts | {
         name: shown(str(value))
         for name, value in recording.metadata.items()

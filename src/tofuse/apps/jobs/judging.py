@@ -598,12 +598,12 @@ def _agreement(judgement: Judgement) -> str:
 
 
 def _read(path: Path) -> TimedPoses:
-    """Read a trajectory, or the poses in a recording, such as those of a phone."""
+    """Read a trajectory, or the poses in a recording, as of a phone, or else its odometry."""
     try:
         return read_poses(path)
     except InputError as no_trajectory:
         try:
-            return read_reference(path)
+            return read_reference(path, or_odometry=True)
         except InputError:
             raise no_trajectory from None
 

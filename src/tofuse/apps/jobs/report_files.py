@@ -66,7 +66,8 @@ def _frames_of(recording: Recording, result: Reconstruction) -> Recording:
 
 def _title(path: Path) -> str:
     """Return the name of a recording; that of its folder for a native recording in a result."""
-    return (path.parent.name if path.name == folders.RECORDING else "") or path.name
+    name = path.stem if path.suffix.lower() == ".zip" else path.name
+    return (path.parent.name if path.name == folders.RECORDING else "") or name
 
 
 def _final_config(config: Config, result: Reconstruction) -> Config:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import AmplitudeKind, DepthKind, RangeFrame
-from tofuse.engine.parts import discover, from_dict, registered
+from tofuse.engine.parts import discover, from_dict, name_of, registered
 
 TIMEOUT_S = 2.0  # without a frame until a camera counts as stopped
 
@@ -78,7 +78,7 @@ class Stream(AbstractContextManager["Stream"], ABC):
         except ImportError as error:
             raise DeviceError(
                 f"needs the package {pip}, which can't be imported ({error})",
-                where="camera",
+                where=name_of(options),
                 remedy=f"run `pip install {pip}`",
             ) from error
         try:

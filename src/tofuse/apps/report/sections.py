@@ -126,6 +126,8 @@ def _plain(s: Subject) -> str:
     accuracy = s.result.diagnostics.accuracy
     if accuracy.assessed and np.isfinite(accuracy.position_m):
         known = f"and its parts fit together to about {quantities.length(accuracy.position_m)}"
+    elif s.result.has_pose.sum() == 1:
+        known = "and was seen by a single image"
     else:
         known = "but how well its parts fit together could not be determined"
     return f"It is about {width} wide, {height} high and {depth} deep, {known}."

@@ -146,7 +146,7 @@ class OutputFolder(staging.StagedFolder):
             raise OutputError(
                 "contains a recording" if recording else "contains an earlier result",
                 where=self.path,
-                remedy="pass --overwrite (Python: overwrite=True) to replace it, or another folder",
+                remedy="pass --overwrite to replace it, or another folder",
             )
         if foreign := self._contract.foreign(folder):
             raise OutputError(

@@ -71,7 +71,7 @@ def check(folder: Path, run: Mapping[str, Any]) -> None:
         raise InputError(
             f"{edited} was changed after the run",
             where=folder,
-            remedy="run again, or pass --edited (Python: edited=True) to use it nevertheless",
+            remedy="run again, or pass --edited to use it nevertheless",
         )
     for problem in _problems(run):
         raise InputError(problem, where=folder / _SELF, remedy="run again")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
@@ -17,16 +18,12 @@ from tofuse.engine.frames.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number
+from tofuse.engine.times import check_seconds
 
 # The unit of integer depth for nearly all cameras.
 _MILLIMETRES = 1e-3
 # A larger median of depth can't be in metres.
 _MAX_MEDIAN_M = 200.0
-# Longest median interval of frames, s; also for a camera that runs freely: most intervals, up to
-# these percentiles, differ by less than this factor. And units that are mistaken for seconds.
-_MAX_INTERVAL_S, _MAX_REGULAR_INTERVAL_S = 1000.0, 5.0
-_MOST, _REGULAR_RATIO, _MIN_INTERVALS = (12.5, 50.0, 87.5), 1.5, 4
-_UNITS = {"ms": 1e3, "us": 1e6, "ns": 1e9}
 
 
 def from_arrays(
@@ -62,7 +59,8 @@ def from_arrays(
     confidence
         (N, H, W) uint8, higher is better, 0 where nothing was measured.
     timestamps
-        (N,) s, or datetime64 or timedelta64; 30 images per second unless given.
+        (N,) s, or datetime64 or timedelta64, or dates and durations of Python; 30 images per second
+        unless given.
     reference
         (N, 4, 4) T_world_camera, NaN where unknown; used only for comparison.
     odometry
@@ -239,7 +237,7 @@ def _times(timestamps: ArrayLike | None, count: int) -> Float64:
         return np.arange(count) / 30
     given = np.asarray(timestamps)
     is_number = given.dtype.kind in "iuf"
-    times = _seconds(given) if given.dtype.kind in "iufmM" else np.full(given.shape, np.nan)
+    times = _seconds(given)
     if times.shape != (count,):
         raise InputError(
             f"have shape {times.shape}, and depth {count} images",
@@ -256,30 +254,26 @@ def _times(timestamps: ArrayLike | None, count: int) -> Float64:
             remedy="use seconds, and leave out images that repeat",
         )
     if is_number and count > 1:
-        _check_seconds(np.diff(times))
+        check_seconds(times)
     return times
-
-
-def _check_seconds(steps: Float64) -> None:
-    """Raise InputError if intervals between frames are those of a camera in another unit."""
-    low, interval, high = np.percentile(steps, _MOST)
-    is_regular = len(steps) >= _MIN_INTERVALS and high < _REGULAR_RATIO * low
-    if interval > (_MAX_REGULAR_INTERVAL_S if is_regular else _MAX_INTERVAL_S):
-        unit = next((name for name, factor in _UNITS.items() if interval < factor), "ns")
-        raise InputError(
-            f"have a median interval of {interval:.4g}, which is that of a camera in {unit}",
-            where="timestamps",
-            remedy=f"divide them by {_UNITS[unit]:.0e}, or use timedelta64, which states its unit",
-        )
 
 
 def _seconds(times: NDArray[Any]) -> Float64:
     """Timestamps as numbers; dates and durations in seconds since the epoch, or since zero."""
-    if times.dtype.kind not in "mM":
+    if times.dtype.kind in "iuf":
         return times.astype(float)
+    if times.dtype.kind not in "mM":
+        return np.array([_seconds_of(time) for time in times.flat], float).reshape(times.shape)
     missing = np.isnat(times)
     ns = times.astype(f"{times.dtype.kind}8[ns]").astype(np.int64)
     return np.where(missing, np.nan, ns // 10**9 + ns % 10**9 / 1e9)
+
+
+def _seconds_of(time: object) -> float:
+    """A date of Python, as NumPy's in UTC unless it states its zone, or a duration; else NaN."""
+    if isinstance(time, datetime):
+        return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
+    return time.total_seconds() if isinstance(time, timedelta) else np.nan
 
 
 def _poses(name: str, values: ArrayLike | None, count: int) -> Float64 | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, overload
@@ -89,7 +89,8 @@ class Recording:
     ``len(recording)``, ``recording[k]`` and iteration give the selected frames, and
     ``recording[a:b:n]`` is a recording of fewer frames. Iteration reads
     ahead on another thread, and raises for an unreadable frame when its turn comes; `read_all`
-    yields the error in its place instead.
+    yields the error in its place instead. Pickled for another process, a recording of files is
+    opened anew there.
 
     Attributes
     ----------
@@ -101,15 +102,24 @@ class Recording:
         Name of the reader.
     indices
         (M,) indices of the selected frames in the source.
+    opened
+        The source as it was opened, and how to open it again; None if it is in memory.
     """
 
     source: Source
     path: str
     format: str
     indices: Intp
+    opened: tuple[Source, Callable[[], Recording]] | None = None
 
     @classmethod
-    def of(cls, source: Source, path: str | Path, format: str) -> Recording:  # noqa: A002
+    def of(
+        cls,
+        source: Source,
+        path: str | Path,
+        format: str,  # noqa: A002
+        opened: Callable[[], Recording] | None = None,
+    ) -> Recording:
         """Make a recording of all frames of a source.
 
         Parameters
@@ -120,8 +130,17 @@ class Recording:
             Where they come from, for messages.
         format
             Name of the reader.
+        opened
+            Opens it again; None if it is in memory.
         """
-        return cls(source, str(path), format, np.arange(len(source.timestamps)))
+        indices = np.arange(len(source.timestamps))
+        again = None if opened is None else (source, opened)
+        return cls(source, str(path), format, indices, again)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self.opened is None or self.opened[0] is not self.source:
+            return Recording, (self.source, self.path, self.format, self.indices)
+        return _opened_again, (self.opened[1], self.indices)
 
     def __repr__(self) -> str:
         return f"Recording: {len(self)} frames of {self.path} ({self.format})"
@@ -198,7 +217,7 @@ class Recording:
                 where=self.path,
                 remedy="change --start, --end or --every",
             )
-        return Recording(self.source, self.path, self.format, indices)
+        return replace(self, indices=indices)
 
     def sample(self, count: int) -> list[Frame | UnreadableFrameError]:
         """Read up to `count` evenly spaced frames, including the first and the last.
@@ -304,6 +323,10 @@ class Recording:
                 yield item
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def _opened_again(opened: Callable[[], Recording], indices: Intp) -> Recording:
+    return replace(opened(), indices=indices)
 
 
 @overload

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import Spill
+from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
 from tofuse.engine.fusion.mesh import Mesh
@@ -121,9 +123,8 @@ class ModelBuilder:
         T_world_camera = np.array([poses[summary.index] for summary in views.summaries], float)
         mesh = fuse_surface(views, T_world_camera, self._options, advance)
         if len(mesh):
-            faces = self._options.faces
             with timing("meshing"):
-                model = Model(mesh.cloud(), mesh.decimated(faces) if faces else mesh)
+                model = Model(mesh.cloud(), at_most(mesh, self._options.faces))
         else:
             clouds = (view.as_cloud() for view in views)
             model = Model(self._average(clouds, poses, self._range_voxel), mesh)
@@ -166,3 +167,12 @@ class ModelBuilder:
             if advance is not None:
                 advance()
         return builder.finish(normals=normals)
+
+
+def at_most(mesh: Mesh, faces: int) -> Mesh:
+    """Return the mesh of at most so many triangles (0: all), or more where these leave nothing."""
+    while 0 < faces < len(mesh.faces):
+        with suppress(InputError):
+            return mesh.decimated(faces)
+        faces *= 2
+    return mesh

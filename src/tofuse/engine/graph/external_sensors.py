@@ -113,7 +113,7 @@ class SensorPriors:
     records
         One for each sensor, for the report.
     witness
-        Steps of verified odometry that poses are compared with, but which don't change them.
+        Steps of odometry that poses are compared with, but which don't change them.
     """
 
     steps: tuple[Measured, ...] = ()

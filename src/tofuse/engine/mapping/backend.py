@@ -191,8 +191,7 @@ class BackEnd:
         self._progress.stage("refining")
         # Elsewhere images alone: their errors are estimated from the result.
         steps = self._tracked.steps_at_degenerate(closed.sensors)
-        witness = closed.sensors.steps if closed.sensors.verified else ()
-        images = replace(closed.sensors, steps=steps, witness=witness)
+        images = replace(closed.sensors, steps=steps, witness=closed.sensors.steps)
         refinement = self._observations.refiner.finish(graph, images)
         if refinement.kept:
             graph = self._tracked.build(closed.loops, refinement, confirmed=closed.confirmed)
@@ -237,6 +236,9 @@ class BackEnd:
         fused = model.fuse(
             dict(zip(ids, graph.poses, strict=True)), self._progress.advance, refinement.errors
         )
+        limit, count = self._config.fusion.faces, len(fused.mesh.faces) if fused.mesh else 0
+        if 0 < limit < count:
+            self._progress.note(f"{limit} triangles (faces) leave no surface: it has {count}")
         initial_poses = dict(zip(ids, closed.sequential, strict=True))
         return fused, model.sketch(initial_poses) if poses_changed and model.surface else None
 

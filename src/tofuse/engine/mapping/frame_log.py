@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from tofuse.engine.alignment import Link
 from tofuse.engine.arrays import Float64
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, InputWarning
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import external_sensors
@@ -17,10 +18,12 @@ from tofuse.engine.loops import TrackedComponent
 from tofuse.engine.mapping.config import ViewKind, kind_of
 from tofuse.engine.results import FrameRecord
 from tofuse.engine.stored_views import ViewStore
+from tofuse.engine.times import check_seconds
 from tofuse.engine.tracking import Step
 from tofuse.engine.views import PreparedView
 
 _FAR_M = 100.0  # no depth camera measures as far
+_TIMES = 5  # before the latest, whose intervals show their unit
 
 
 class FrameSequence:
@@ -36,6 +39,7 @@ class FrameSequence:
         self.kind: ViewKind | None = None
         self._index: int | None = None
         self._previous: RangeFrame | None = None  # uncorrected
+        self._times: list[float] | None = []  # None once the user was warned of them
 
     def check_kind(self, frame: Frame) -> bool:
         """Return whether it is the first frame; InputError for another kind than those before."""
@@ -55,6 +59,28 @@ class FrameSequence:
                 f"comes after frame {self._index}",
                 where=f"frame {index}",
                 remedy="number the frames in the order in which they are pushed",
+            )
+
+    def check_time(self, frame: Frame) -> None:
+        """Warn, once, of a time that does not ascend, or not as that of a camera in seconds."""
+        if self._times is None or not frame.timestamp:  # 0 is that of frames without time
+            return
+        problem = ""
+        if self._times and frame.timestamp <= self._times[-1]:
+            problem = f"is {frame.timestamp:.10g}, after {self._times[-1]:.10g}"
+        self._times = [*self._times[-_TIMES:], frame.timestamp]
+        try:
+            if not problem and len(self._times) > 1:
+                check_seconds(np.array(self._times))
+        except InputError as error:
+            problem = error.problem
+        if problem:
+            self._times = None
+            warnings.warn(
+                f"frame {frame.index}: timestamp {problem}; motion is predicted by times: pass "
+                "seconds that ascend, and leave out frames that repeat",
+                InputWarning,
+                stacklevel=3,
             )
 
     def accept(self, index: int, kind: ViewKind | None = None) -> None:

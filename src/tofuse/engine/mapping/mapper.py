@@ -124,7 +124,8 @@ class Mapper:
         ----------
         frame
             Uncorrected and unfiltered. Its `index` must be larger than those before. Without
-            `history` it is copied: a camera may write the next image into the same arrays.
+            `history` it is copied, as a camera may write the next image into the same arrays, and
+            an InputWarning says once if timestamps do not ascend, or are not in seconds.
         T_odometry
             (4, 4) T_world_camera from odometry or a phone, in any fixed world frame; None or NaN
             where there is none. It is a prior if the configuration has the part "odometry", or is
@@ -155,6 +156,7 @@ class Mapper:
         T_given, down = _odometry(T_odometry), _direction(gravity)
         frame, T_given = self._check(frame, T_given)
         if history is None:
+            self._sequence.check_time(frame)
             frame = frame.copy()
         repeated = self._sequence.is_repeated(frame)
         if repeated:

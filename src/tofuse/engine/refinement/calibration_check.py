@@ -132,7 +132,7 @@ class CalibrationCheck:
     range_change
         Change of the range over the views, if there is one; then no error is estimated.
     contradicted
-        Whether recorded odometry contradicts the error `best`.
+        Whether verified odometry contradicts the error `best`.
     """
 
     alarm: bool = False
@@ -288,10 +288,12 @@ def _check_likely(
     certain = abs(check.errors[best_name]) > check.limit(best_name)
     improves = certain and check.improves
     if check.large or improves:
+        doubted = estimator.is_contradicted(best)
+        contradicted = doubted and aligned.priors.verified
         gap = loop_gap(aligned, best.poses, best.errors)
-        check = replace(check, gap=gap, contradicted=estimator.is_contradicted(best))
-    if check.contradicted:
-        return check
+        check = replace(check, gap=gap, contradicted=contradicted)
+        if doubted:  # odometry of unknown errors only prevents an alarm
+            return check
     confirmed = best_name in check.large and improves and check.confirmed_by_loop
     if confirmed and _in_all_sections(best, best_name, aligned.priors):  # alternative explanations
         others = [name for name in first.determined if name not in check.errors]

@@ -38,6 +38,8 @@ class Priors:
     witness
         Odometry that the result is compared with: of each run of views without a gap their
         positions (K,), and their poses (K, 4, 4) in the first one's frame.
+    verified
+        Whether its errors are known; see `SensorPriors`.
     """
 
     pairs: Intp
@@ -45,6 +47,7 @@ class Priors:
     information: Float64
     gravity: external_sensors.Gravity | None = None
     witness: Sequence[tuple[Intp, Float64]] = ()
+    verified: bool = True
 
     @classmethod
     def none(cls) -> Priors:

@@ -375,6 +375,7 @@ def _priors(ids: Sequence[int], measured: external_sensors.SensorPriors) -> Prio
         np.array([s.information * _CORRELATED_PIXELS for s in steps]).reshape(m, 6, 6),
         gravity,
         measured.witnessed(ids),
+        measured.verified,
     )
 
 

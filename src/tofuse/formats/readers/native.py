@@ -336,7 +336,7 @@ class Native(Reader):
             return Sniff(
                 Sniff.UNCERTAIN,
                 "depth/ but no camera.json",
-                "write one (docs/formats.md), or use --format native --camera camera.json",
+                "write one (docs/formats.md), or use --format native and --camera camera.json",
             )
         return Sniff(Sniff.CERTAIN, "cloud/") if images == "cloud" else None
 

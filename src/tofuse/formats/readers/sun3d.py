@@ -78,7 +78,7 @@ def _check_rotated(stored: UInt16, folder: Path) -> None:
         raise InputError(
             "has depth whose bits are not rotated as in SUN3D",
             where=folder,
-            remedy="use --format redwood --camera camera.json, with its depth_unit_m",
+            remedy="use --format redwood and --camera camera.json, with its depth_unit_m",
         )
 
 

@@ -6,6 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +111,17 @@ def open_recording(
         if file is not None:
             reading.path_of(file, name, f"pass the path of a {name}.json")
     _check_depths(min_depth, max_depth)
+    again = partial(
+        open_recording,
+        *paths,
+        format=format,
+        camera=camera,
+        topic=topic,
+        rig=rig,
+        min_depth=min_depth,
+        max_depth=max_depth,
+    )
+    shown_path = " ".join(map(str, paths))
     inner = [unzipped(path) for path in paths]
     options = ReaderOptions(None if camera is None else Path(camera), topic)
     in_folder = rig_file_in(inner[0]) if rig is None and len(inner) == 1 else None
@@ -121,7 +133,7 @@ def open_recording(
             raise InputError(
                 "do not apply to a rig", where="min_depth, max_depth", remedy="leave them out"
             )
-        return Recording.of(cameras, " ".join(map(str, paths)), "rig")
+        return Recording.of(cameras, shown_path, "rig", again)
     for path in inner:
         _check_kind(path)
     located = [item for path in inner for item in _resolve(path, format)]
@@ -137,7 +149,7 @@ def open_recording(
             source, min_depth or 0.0, float("inf") if max_depth is None else max_depth
         )
     names = dict.fromkeys(name_of(item.reader) for item in located)
-    return Recording.of(source, " ".join(map(str, paths)), "+".join(names))
+    return Recording.of(source, shown_path, "+".join(names), again)
 
 
 def _rig_source(
@@ -384,8 +396,15 @@ def _short_names(paths: list[Path]) -> list[str]:
     return names if len(set(names)) == len(names) else [str(p) for p in paths]
 
 
-def read_reference(path: str | Path) -> TimedPoses:
+def read_reference(path: str | Path, *, or_odometry: bool = False) -> TimedPoses:
     """Read reference poses from a trajectory file, or from a recording of any format.
+
+    Parameters
+    ----------
+    path
+        A file or folder.
+    or_odometry
+        Whether the odometry of a recording without reference poses will do.
 
     Raises
     ------
@@ -400,11 +419,15 @@ def read_reference(path: str | Path) -> TimedPoses:
         readers_of_poses = [lambda: open_recording(path), lambda: read_poses(path)]
     nothing = InputError("has no poses", where=path)
     found = reading.first_readable(readers_of_poses, lambda read: read(), nothing)
-    return found if isinstance(found, TimedPoses) else _reference_of(found, path)
+    if isinstance(found, TimedPoses):
+        return found
+    return _reference_of(found, path, or_odometry=or_odometry)
 
 
-def _reference_of(recording: Recording, path: Path) -> TimedPoses:
+def _reference_of(recording: Recording, path: Path, *, or_odometry: bool) -> TimedPoses:
     poses = recording.reference
+    if poses is None and or_odometry:
+        poses = recording.odometry
     if poses is None or not np.isfinite(poses).all((1, 2)).any():
         raise InputError(
             "has no reference poses",

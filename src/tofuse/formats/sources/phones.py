@@ -11,6 +11,7 @@ from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import Pinhole, scaled
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
+from tofuse.engine.quantities import count
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import read_color, read_image
@@ -79,9 +80,8 @@ class PhoneSource(FileSource):
         self.note_missing_color(self.color)
         present = sum(path is not None for path in self.confidence)
         if present < len(self.confidence):
-            self.warnings.append(
-                f"{len(self.confidence) - present} frames have no confidence image"
-            )
+            missing = count(len(self.confidence) - present, "frame")
+            self.warnings.append(f"no confidence image for {missing}")
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
