@@ -143,6 +143,8 @@ def _derivatives(
 
 def _sections(points: Float32) -> Intp:
     """Return the section (N,) of each point (N, 3 or more) of a view."""
+    if len(points) == 0:
+        return np.zeros(0, np.intp)
     x, y = (points[:, :2] / points[:, 2:3]).T
     section = 4 * (x > np.median(x)) + 2 * (y > np.median(y))
     for quadrant in np.unique(section):
