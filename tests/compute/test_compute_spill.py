@@ -140,7 +140,9 @@ def test_full_disk_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: Full())
     spill: Spill[Item] = Spill(0, tmp_path)
     spill.put(made(0))
-    with pytest.raises(OutputError, match=r"no space left on device.*memory") as caught:
+    with pytest.raises(
+        OutputError, match=r"no space left on device.*or increase memory$"
+    ) as caught:
         spill.put(made(1))
     assert "\n" not in str(caught.value)
 

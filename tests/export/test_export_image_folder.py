@@ -189,7 +189,7 @@ def test_impossible_exports_are_refused(
 def test_only_own_folders_are_replaced(tmp_path: Path) -> None:
     result = made_result(tmp_path, PLAIN)
     (folder,) = export(result, ["colmap"])
-    with pytest.raises(OutputError, match="overwrite"):
+    with pytest.raises(OutputError, match="pass overwrite"):
         export(result, ["colmap"])
     (folder / "images" / "frame_000001.png").unlink()
     export(result, ["colmap"], overwrite=True)

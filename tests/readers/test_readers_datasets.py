@@ -98,7 +98,7 @@ def test_tum_with_colour_of_half_the_rate(tmp_path: Path) -> None:
 
 def test_tum_with_unknown_name_requires_camera(tmp_path: Path) -> None:
     make_tum(tmp_path / "living_room")
-    with pytest.raises(InputError, match="camera"):
+    with pytest.raises(InputError, match=r"with camera=camera\.json"):
         open_recording(tmp_path / "living_room")
     camera = {"schema": 1, "model": "pinhole", "width": 640, "height": 480}
     camera |= {"fx": 481.2, "fy": 480.0, "cx": 319.5, "cy": 239.5}

@@ -106,7 +106,9 @@ def camera_json(folder: Path, **changes: object) -> Path:
 
 def test_tiff3d_with_camera(tmp_path: Path) -> None:
     made.make_tiff3d(tmp_path / "a")
-    with pytest.raises(InputError, match=r"has no camera: the layout of \.t3c .*camera"):
+    with pytest.raises(
+        InputError, match=r"has no camera: the layout of \.t3c .* use camera=camera\.json"
+    ):
         open_recording(tmp_path / "a")
     camera = camera_json(tmp_path, frame_rate_hz=25.0, ambiguity_m=7.5)
     recording = open_recording(tmp_path / "a", camera=camera)
@@ -127,7 +129,7 @@ def test_other_tiffs_are_depth_on_request(tmp_path: Path) -> None:
     counts[0, 0] = 65535
     cv2.imwrite(str(folder / "depth_1.tiff"), counts)
     cv2.imwrite(str(folder / "confidence_1.tiff"), counts)
-    with pytest.raises(InputError, match="use format tiff and camera"):
+    with pytest.raises(InputError, match=r"use format tiff and camera=camera\.json"):
         open_recording(folder)
     camera = camera_json(tmp_path, depth_unit_m=1e-4, depth_kind="z")
     frame = open_recording(folder, format="tiff", camera=camera)[0]

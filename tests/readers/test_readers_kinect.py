@@ -152,7 +152,9 @@ def test_missing_tracks_and_calibration_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="only infrared"):
         open_recording(path)
     made.make_mkv(path, depth, without="calibration")
-    with pytest.raises(InputError, match=r"calibration\.json: is missing; pass .* camera"):
+    with pytest.raises(
+        InputError, match=r"calibration\.json: is missing; pass .* with camera=camera\.json"
+    ):
         open_recording(path)
     camera = {"schema": 1, "model": "pinhole", "width": 320, "height": 288, "fx": 250, "fy": 250}
     camera |= {"cx": 160, "cy": 144, "depth_unit_m": 0.001, "depth_kind": "z"}

@@ -135,7 +135,7 @@ def test_cloud_beside_native_recording_is_ignored(tmp_path: Path) -> None:
 def test_images_without_a_camera(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", [1])
     (folder / "camera.json").rename(tmp_path / "camera.json")
-    with pytest.raises(InputError, match=r"depth/ but no camera\.json.*camera"):
+    with pytest.raises(InputError, match=r"depth/ but no camera\.json.*camera=camera\.json"):
         open_recording(folder)
     camera = tmp_path / "camera.json"
     assert depths(open_recording(folder, format="native", camera=camera)) == [1]

@@ -4,8 +4,9 @@ A wrong focal length or principal point, neglected lens distortion or a depth of
 trajectory, and no single registration reveals it. But where views overlap, and above all where a
 path closes a loop, their residuals can't all be small. So each error is estimated separately, with
 all poses free. An error that makes the views more consistent is a proposal. It is an alarm if it
-exceeds the calibration error of usual cameras, and the gap of a loop by pairwise alignments of
-neighbours does not grow with it, or, for focal length and offset, confirms it.
+exceeds the calibration error of usual cameras, sections of the images agree on it, and the gap of a
+loop by pairwise alignments of neighbours does not grow with it, or, for focal length and offset,
+confirms it.
 
 The focal length stands for other errors too: a constant offset of the depth has much the same
 effect. A camera whose range changes has no single calibration: see `range_change`.
@@ -511,15 +512,15 @@ def _check_by_loop(
     if not explanations:
         return without_error
     best = min(explanations, key=lambda name: explanations[name][1].remaining_m)
-    _, gap, is_large = explanations[best]
-    if not is_large:
+    large = {name: error for name, (error, _, is_large) in explanations.items() if is_large}
+    if best not in large:
         return without_error
     return replace(
         without_error,
         alarm=True,
-        errors={name: error for name, (error, _, large) in explanations.items() if large},
-        sigmas={name: first.sigmas[name] for name, (*_, large) in explanations.items() if large},
-        gap=gap,
+        errors=large,
+        sigmas={name: first.sigmas[name] for name in large},
+        gap=explanations[best][1],
         best=best,
     )
 
