@@ -9,17 +9,16 @@ views are scaled by it and aligned again.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.camera_response import Linearised, significance_of
 from tofuse.engine.refinement.joint_alignment import RefinedViews, align_views
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, thinned
-from tofuse.engine.stored_views import SampledView, pair_equations
+from tofuse.engine.stored_views import pair_equations
 
 # Makers specify range errors of up to a percent. Those that depend on the distance, or multipath,
 # look like smaller changes, as later views see other distances.
@@ -109,18 +108,12 @@ class LikelyChange:
         return abs(self.scale) > self.limit * self.sigma
 
 
-def likely_change(
-    linearised: Linearised, views: Sequence[SampledView], pairs: Intp
-) -> LikelyChange | None:
+def likely_change(linearised: Linearised) -> LikelyChange | None:
     """Return the best step or drift over the views; None if it is no more than noise.
 
-    Parameters
-    ----------
-    linearised, pairs
-        N views with pairs (M, 2), linearised at their refined poses.
-    views
-        The views.
+    The views are linearised at their refined poses.
     """
+    views, pairs = linearised.state.views, linearised.state.pairs
     count = len(views)
     index = np.array([view.index for view in views], float)
     drift = (index - index[0]) / max(float(np.ptp(index)), 1.0)
