@@ -299,7 +299,7 @@ class Assessment:
         cross_view: cross_view_agreement.CrossViewConsistency | None,
     ) -> pose_accuracy.ObservedErrors:
         """Return the errors of the poses that their covariances don't include."""
-        refinement = refined.refinement
+        refinement, corrections = refined.refinement, self._estimated_corrections
         shift = refinement.disputed_m, refinement.disputed_rad
         if self._is_tracked:  # the initial error of given poses is unrelated to the final one
             moved = trajectory_errors.displacement(
@@ -309,10 +309,10 @@ class Assessment:
         excess_m = 0.0 if cross_view is None else cross_view.excess_m()
         calibration = 0.0, 0.0
         if refinement.calibration_check is not None:
-            calibration = camera_uncertainty.pose_errors(refinement.calibration_check)
+            calibration = camera_uncertainty.pose_errors(refinement.calibration_check, corrections)
         split = refinement.split_m, refinement.split_rad
         return pose_accuracy.ObservedErrors(
-            *shift, excess_m, *calibration, *split, corrected=bool(self._estimated_corrections)
+            *shift, excess_m, *calibration, *split, corrected=bool(corrections)
         )
 
     def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:

@@ -25,6 +25,7 @@ from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
 from tofuse.engine.quantities import length, percent
 from tofuse.engine.refinement.camera_response import (
+    SECTIONS,
     SIGNIFICANT,
     Linearised,
     Posterior,
@@ -69,6 +70,9 @@ USUAL, _UNUSUAL = 0.01 / 3**0.5, 0.1
 # Standard deviations by which a certain error exceeds the tolerance; and of a usual one that may
 # improve the views: worth a full estimate from this fraction of the tolerance.
 _CERTAIN, _PROMISING, _MIN_FIRST_STEP = 3.0, 4.0, 0.2
+# Multipath or mixed pixels may shift all sections of the images as much as these differ: multiple
+# of the standard deviation of an estimate, which is their mean.
+HIDDEN = SECTIONS**0.5
 # Views determine an error if they reduce the variance of usual ones to this fraction.
 _DETERMINED = 2 / 3
 # Errors that the drift over a loop can reveal; that by the others resembles any drift.
