@@ -508,7 +508,9 @@ def test_component_that_starts_elsewhere_is_no_jump() -> None:
 
 def test_calibration_without_loop_confirmation_is_noted() -> None:
     """Only a note: the factory calibration of a camera is usually right."""
-    found = CalibrationCheck(False, {"focal": -0.05}, estimates={"focal": (-0.05, 0.003)})
+    found = CalibrationCheck(
+        False, {"focal": -0.05}, support=(0.8, 0.85), estimates={"focal": (-0.05, 0.003)}
+    )
     refinement = Refinement(np.zeros((9, 4, 4)), True, 9, 20, calibration_check=found)
 
     def warnings_of(suspicion: CalibrationCheck) -> list[str]:

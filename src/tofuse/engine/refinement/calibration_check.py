@@ -67,6 +67,8 @@ QUANTITIES = {
 # Standard deviation of the errors of usual cameras, uniform up to the tolerance, which is the same
 # for all; and of one that is not usual.
 USUAL, _UNUSUAL = 0.01 / 3**0.5, 0.1
+# Logarithm of the factor by which views are likelier with an error: strong evidence (Jeffreys 1961).
+_STRONG = float(np.log(10))
 # Standard deviations by which a certain error exceeds the tolerance; and of a usual one that may
 # improve the views: worth a full estimate from this fraction of the tolerance.
 _CERTAIN, _PROMISING, _MIN_FIRST_STEP = 3.0, 4.0, 0.2
@@ -116,7 +118,8 @@ class CalibrationCheck:
         Mean support of the views without and with all errors as estimated in full, see
         `joint_alignment.Support`; None if they were not.
     gap
-        Closure error of the longest loop; None if there is none, or no error is certain.
+        Closure error of the longest loop; None if there is none, or the views don't support the
+        estimates.
     estimates
         Joint estimate of all errors and their standard deviations by name: by one Newton step, or
         in full if one is not usual. Empty if there are too few views.
@@ -175,15 +178,19 @@ class CalibrationCheck:
 
     @property
     def unconfirmed(self) -> dict[str, float]:
-        """Certain errors without an alarm that neither a loop nor odometry contradicts."""
-        if self.alarm or self.contradicted or (self.gap is not None and self.gap.contradicts):
-            return {}
-        return self.errors if self.certain else {}
+        """A certain error without an alarm that may well be true."""
+        return self.errors if self.certain and self.is_likely and not self.alarm else {}
 
     @property
     def is_likely(self) -> bool:
-        """Whether the estimates may well be true: an unusual error, or the views agree better."""
-        return (bool(self.errors) or self.improves) and not self.contradicted
+        """Whether the estimates may well be true, and nothing contradicts them."""
+        contradicted = self.contradicted or (self.gap is not None and self.gap.contradicts)
+        return self.alarm or (self.is_supported and not contradicted)
+
+    @property
+    def is_supported(self) -> bool:
+        """Whether the views agree better with the estimates, or clearly show an unusual error."""
+        return self.improves or (bool(self.errors) and self.evidence > _STRONG)
 
     @property
     def improves(self) -> bool:
@@ -342,13 +349,13 @@ def _check_promising(
         moved=rms_motion(aligned.refined.poses, fit.poses),
         spread=estimate.spread,
     )
-    if check.certain:
+    if check.is_supported:
         doubted = estimator.is_contradicted(fit)
         gap = loop_gap(aligned, fit.poses, fit.errors)
         check = replace(check, gap=gap, contradicted=doubted and aligned.priors.verified)
         if doubted:  # odometry of unknown errors only prevents an alarm
             return check
-        if check.improves and check.confirmed_by_loop:
+        if check.improves and check.certain and check.confirmed_by_loop:
             return replace(check, alarm=True)
     of_loop = _check_by_loop(aligned, without_error)
     return of_loop if of_loop.alarm else check
