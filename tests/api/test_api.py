@@ -59,6 +59,16 @@ def test_reconstruction_from_arrays_matches_reference(result):
     assert re.fullmatch(r"Evaluation: ATE 0\.00\d+ m, .* over 6 poses", repr(found))
 
 
+def test_what_python_prints_fits_a_line(result):
+    located = result.locate(result.source[1])
+    length = result.distance(*result.cloud.points[:2])
+    for shown in (result, result.graph, result.diagnostics, located, length):
+        assert re.match(r"\w+(: | \d)", repr(shown))
+        assert len(repr(shown)) < 120
+    assert repr(result.diagnostics).startswith("Diagnostics: ")
+    assert "array" not in repr(result.diagnostics.frames[1])
+
+
 def test_result_changed_by_hand_is_not_saved(result, tmp_path) -> None:
     changed = tofuse.load(result.save(tmp_path / "out"))
     with pytest.raises(OutputError, match=r"pass overwrite to replace it"):
