@@ -59,6 +59,15 @@ def test_reconstruction_from_arrays_matches_reference(result):
     assert re.fullmatch(r"Evaluation: ATE 0\.00\d+ m, .* over 6 poses", repr(found))
 
 
+def test_evaluation_notes_images_of_another_recording(result, arrays):
+    depth, K, poses = arrays
+    assert result.evaluate().notes == ()
+    receding = 0.2 * np.arange(6, dtype=np.float32)[:, None, None]
+    other = tofuse.from_arrays(depth + receding, K)
+    (note,) = tofuse.evaluate(result, poses, recording=other).notes
+    assert re.fullmatch(r"only \d+ % of the points .*, or .* is another recording", note)
+
+
 def test_what_python_prints_fits_a_line(result):
     located = result.locate(result.source[1])
     length = result.distance(*result.cloud.points[:2])
