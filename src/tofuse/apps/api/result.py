@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import sys
 import tempfile
 import webbrowser
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,7 @@ from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from tofuse.apps.certainty import Length, LengthErrors
-from tofuse.apps.cli import TerminalProgress
+from tofuse.apps.cli import progress_in_python
 from tofuse.apps.jobs import (
     Evaluation,
     evaluate,
@@ -352,7 +351,7 @@ def reconstruct(
         Measurements of other sensors to use, as ``--prior`` of `tofuse run`: "auto" uses gravity,
         and a phone's own poses, "none" the images alone, "device" the recorded odometry too.
     progress
-        True: progress bars on the terminal.
+        True: progress bars on the terminal and in notebooks with ipywidgets, else a line a stage.
 
     Raises
     ------
@@ -421,7 +420,7 @@ def merge(
 
 
 def _with_terminal(progress: Progress | bool | None) -> AbstractContextManager[Progress]:
-    return TerminalProgress(sys.stderr) if progress is True else nullcontext(receiver(progress))
+    return progress_in_python() if progress is True else nullcontext(receiver(progress))
 
 
 def load(folder: str | Path, *, edited: bool = False) -> Result:
