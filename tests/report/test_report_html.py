@@ -229,6 +229,21 @@ def test_frames_without_colour_show_their_range(tmp_path):
     assert re.search(r'data-kind="color" src="data:,"\s+hidden', got.text)
 
 
+@pytest.mark.parametrize(
+    ("up", "turn"),
+    [
+        ((-1, 0, 0), "90"),
+        ((0.1, 1, 0), "180"),
+        ((1, 0, -1), "270"),
+        ((0, -1, 0), ""),
+        ((0, 0, 1), ""),
+    ],
+)
+def test_images_of_a_turned_camera_are_upright(up, turn, tmp_path):
+    got = page(tmp_path, lonely(up=np.array(up, float)), ReportExtras("x"))
+    assert re.findall(r"transform: rotate\((\d+)deg\)", got.text) == [turn] * bool(turn)
+
+
 def test_summary_shows_where_its_advice_applies(tmp_path):
     frames = tuple(FrameRecord(k, 0.1 * k, "tracked") for k in range(9))
     for ranges, links in ((((3, 4),), 1), (((0, 8),), 0)):

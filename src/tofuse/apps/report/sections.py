@@ -74,6 +74,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         shown = [(name, title) for name, title, _ in listed if contents[name] is not None]
         return {
             "title": extras.title,
+            "turn": subject.image_turn,
             "result": result,
             "contents": [("model", "Model"), *shown, ("reading", "How to read this")],
             **model.result(),
