@@ -68,6 +68,15 @@ def test_evaluation_notes_images_of_another_recording(result, arrays):
     assert re.fullmatch(r"only \d+ % of the points .*, or .* is another recording", note)
 
 
+def test_equal_trajectories_have_no_notes():
+    poses = np.tile(np.eye(4), (60, 1, 1))
+    poses[:, 0, 3] = 50 * np.arange(60)  # aligning them leaves an error of rounding
+    assert tofuse.evaluate(poses, poses).notes == ()
+    scaled = poses.copy()
+    scaled[:, 0, 3] *= 1.004
+    assert "the reference is 1.004 times as large" in tofuse.evaluate(poses, scaled).notes[0]
+
+
 def test_what_python_prints_fits_a_line(result):
     located = result.locate(result.source[1])
     length = result.distance(*result.cloud.points[:2])
