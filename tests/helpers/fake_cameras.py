@@ -172,7 +172,7 @@ class FakeK4A(ModuleType):
 
 
 class FakeOrbbec(ModuleType):
-    """pyorbbecsdk: mm per count, milliseconds, None if no frame arrives in time."""
+    """pyorbbecsdk: mm per count, microseconds, None if no frame arrives in time."""
 
     class OBError(Exception):
         pass
@@ -184,14 +184,14 @@ class FakeOrbbec(ModuleType):
         self.left, self.stopped, self.infrared = frames, 0, infrared
         names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
         values = (0.5, -2.6, 1.4, 0.4, -2.4, 1.4, 0.0001, -0.0002) if rational else (0.0,) * 8
-        distortion = SimpleNamespace(**dict(zip(names, values, strict=True)))
+        self.distortion = SimpleNamespace(**dict(zip(names, values, strict=True)))
         lens = SimpleNamespace(width=WIDTH, height=HEIGHT, fx=30.0, fy=30.5, cx=15.5, cy=12.0)
         self.profile = SimpleNamespace(
             get_width=lambda: WIDTH,
             get_height=lambda: HEIGHT,
             get_fps=lambda: 30,
             get_intrinsic=lambda: lens,
-            get_distortion=lambda: distortion,
+            get_distortion=lambda: self.distortion,
         )
 
     def Config(self) -> Any:
@@ -231,7 +231,7 @@ class FakeOrbbec(ModuleType):
             get_height=lambda: HEIGHT,
             get_data=lambda: np.frombuffer(counts.tobytes(), np.uint8),
             get_depth_scale=lambda: 0.5,
-            get_timestamp=lambda: 700.0 + 1000 / 30 * k,
+            get_timestamp_us=lambda: 700_000 + round(1e6 / 30 * k),
         )
 
 

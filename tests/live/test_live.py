@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 from importlib.machinery import ModuleSpec
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -148,7 +148,14 @@ def test_orbbec_stream(install: Install) -> None:
     camera = stream.settings.camera
     assert isinstance(camera, Rational)
     assert (camera.k1, camera.p1, camera.k3, camera.k4) == (0.5, 0.0001, 1.4, 0.4)
+    assert frame.timestamp == pytest.approx(0.7 + 2 / 30, abs=1e-6)
     assert package.stopped == 1
+    package.left, package.distortion.model = 6, SimpleNamespace(name="KANNALA_BRANDT4")
+    with pytest.raises(DeviceError, match="lens of the model KANNALA_BRANDT4"):
+        device_named("orbbec", {}).open()
+    package.left, package.distortion.model = 6, SimpleNamespace(name="BROWN_CONRADY_K6")
+    with device_named("orbbec", {}).open() as stream:
+        assert isinstance(stream.settings.camera, Rational)
 
 
 @pytest.mark.parametrize("converted", [True, False])

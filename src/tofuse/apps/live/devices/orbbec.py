@@ -1,4 +1,4 @@
-"""Orbbec's cameras (Femto, Gemini, Astra), by the package pyorbbecsdk."""
+"""Orbbec's cameras (Femto, Gemini, Astra), by the package pyorbbecsdk, of version 1 or 2."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from tofuse.engine.cameras import DISTORTION_ORDER
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import lenses
+
+# Models whose coefficients have other meanings than those of the rational model.
+_OTHER_LENSES = ("MODIFIED_BROWN_CONRADY", "INVERSE_BROWN_CONRADY", "KANNALA_BRANDT4")
 
 
 class OrbbecStream(Stream):
@@ -45,6 +48,13 @@ class OrbbecStream(Stream):
         intrinsics = {name: float(getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")}
         names = DISTORTION_ORDER["rational"]
         coefficients = {name: float(getattr(distortion, name)) for name in names}
+        model = getattr(getattr(distortion, "model", None), "name", "")  # version 1 states none
+        if any(coefficients.values()) and model in _OTHER_LENSES:
+            raise DeviceError(
+                f"has a lens of the model {model}",
+                where="Orbbec",
+                remedy="record with Orbbec's viewer, and describe the lens by --camera camera.json",
+            )
         size = _size(self._profile)
         return Settings(
             str(self._pipeline.get_device().get_device_info().get_name()),
@@ -62,7 +72,7 @@ class OrbbecStream(Stream):
         infrared = frames.get_ir_frame() if self._infrared else None
         return self.frame(
             index,
-            depth.get_timestamp() / 1000.0,
+            depth.get_timestamp_us() / 1e6,
             _image(depth),
             None if infrared is None else _image(infrared),
         )
@@ -89,7 +99,7 @@ class Orbbec(Device):
     """
 
     maker: ClassVar[str] = "Orbbec"
-    package: ClassVar[tuple[str, str]] = ("pyorbbecsdk", "pyorbbecsdk")
+    package: ClassVar[tuple[str, str]] = ("pyorbbecsdk2", "pyorbbecsdk")
     stream: ClassVar[type[Stream]] = OrbbecStream
     infrared: bool = True
 
