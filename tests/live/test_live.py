@@ -293,7 +293,10 @@ def test_slow_disk_drops_and_counts_frames(install: Install, tmp_path: Path) -> 
 
 
 def test_record_command(
-    install: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    install: Install,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     install(FakeK4A())
     out = tmp_path / "rec"
@@ -301,6 +304,9 @@ def test_record_command(
     assert "2 frames in" in capsys.readouterr().out
     assert main(["inspect", str(out)]) == 0
     assert "Azure Kinect" in capsys.readouterr().out
+    monkeypatch.delitem(sys.modules, "pyk4a")  # the folder is checked before the camera
+    assert main(["record", "azure-kinect", "--out", str(out)]) == 2
+    assert f"{out}: isn't empty" in capsys.readouterr().err
     assert main(["record"]) == 0
     listed = capsys.readouterr().out
     assert all(name in listed for name in known_devices())
