@@ -44,6 +44,9 @@ def arrays():
     )
 
 
+UPS = (0.0, -1.0, 0.0), (-1.0, 0.0, 0.0)
+
+
 @pytest.fixture(scope="module")
 def result(arrays):
     depth, K, poses = arrays
@@ -66,6 +69,13 @@ def test_evaluation_notes_images_of_another_recording(result, arrays):
     other = tofuse.from_arrays(depth + receding, K)
     (note,) = tofuse.evaluate(result, poses, recording=other).notes
     assert re.fullmatch(r"only \d+ % of the points .*, or .* is another recording", note)
+
+
+def test_picture_in_a_notebook_is_upright(result):
+    """As in the report, however the camera was held."""
+    level, turned = (replace(result, up=np.array(up))._repr_html_() for up in UPS)
+    assert level.startswith('<div><img src="data:image/png')
+    assert level != turned
 
 
 def test_equal_trajectories_have_no_notes():

@@ -272,12 +272,14 @@ class Result(Reconstruction):
         from tofuse.apps.report import scene, thumbnails
 
         rows = {f.index: k for k, f in enumerate(self.diagnostics.frames)}
-        drawn = scene.make_scene(self, rows)
+        R_display_world = self.T_up_world[:3, :3] * [[1.0], [-1.0], [-1.0]]
+        drawn = scene.make_scene(self, rows).view_rotation(R_display_world)
         accuracy = html.escape(self.accuracy)
         verdict = html.escape(self.diagnostics.verdict.capitalize())
         picture = ""
         if len(drawn.points):
-            source = thumbnails.data_uri(scene.render(drawn, _THUMBNAIL))
+            image = scene.render(drawn, _THUMBNAIL, yaw=scene.opening_yaw(drawn))
+            source = thumbnails.data_uri(image)
             picture = f'<img src="{source}" alt="The model" style="border-radius:8px"><br>'
         return f"<div>{picture}<b>{verdict}</b>: {accuracy}</div>"
 
