@@ -44,6 +44,9 @@ def arrays():
     )
 
 
+UPS = (0.0, -1.0, 0.0), (-1.0, 0.0, 0.0)
+
+
 @pytest.fixture(scope="module")
 def result(arrays):
     depth, K, poses = arrays
@@ -57,6 +60,41 @@ def test_reconstruction_from_arrays_matches_reference(result):
     assert found.error.ate_rms_m < 0.004
     assert found.consistency.rms_m < 0.004
     assert re.fullmatch(r"Evaluation: ATE 0\.00\d+ m, .* over 6 poses", repr(found))
+
+
+def test_evaluation_notes_images_of_another_recording(result, arrays):
+    depth, K, poses = arrays
+    assert result.evaluate().notes == ()
+    receding = 0.2 * np.arange(6, dtype=np.float32)[:, None, None]
+    other = tofuse.from_arrays(depth + receding, K)
+    (note,) = tofuse.evaluate(result, poses, recording=other).notes
+    assert re.fullmatch(r"only \d+ % of the points .*, or .* is another recording", note)
+
+
+def test_picture_in_a_notebook_is_upright(result):
+    """As in the report, however the camera was held."""
+    level, turned = (replace(result, up=np.array(up))._repr_html_() for up in UPS)
+    assert level.startswith('<div><img src="data:image/png')
+    assert level != turned
+
+
+def test_equal_trajectories_have_no_notes():
+    poses = np.tile(np.eye(4), (60, 1, 1))
+    poses[:, 0, 3] = 50 * np.arange(60)  # aligning them leaves an error of rounding
+    assert tofuse.evaluate(poses, poses).notes == ()
+    scaled = poses.copy()
+    scaled[:, 0, 3] *= 1.004
+    assert "the reference is 1.004 times as large" in tofuse.evaluate(poses, scaled).notes[0]
+
+
+def test_what_python_prints_fits_a_line(result):
+    located = result.locate(result.source[1])
+    length = result.distance(*result.cloud.points[:2])
+    for shown in (result, result.graph, result.diagnostics, located, length):
+        assert re.match(r"\w+(: | \d)", repr(shown))
+        assert len(repr(shown)) < 120
+    assert repr(result.diagnostics).startswith("Diagnostics: ")
+    assert "array" not in repr(result.diagnostics.frames[1])
 
 
 def test_result_changed_by_hand_is_not_saved(result, tmp_path) -> None:

@@ -9,15 +9,20 @@ import re
 import subprocess
 import sys
 import time
+from importlib.machinery import ModuleSpec
+from types import ModuleType
 
 import numba
 import pytest
+from rich.console import Console
 
 from tofuse.apps.cli.progress import (
     JsonProgress,
+    LineProgress,
     QuietProgress,
     TerminalProgress,
     progress_for,
+    progress_in_python,
 )
 from tofuse.engine.results.types import FrameRecord
 
@@ -28,6 +33,24 @@ def test_output_stream_selects_progress_type(monkeypatch) -> None:
     assert isinstance(progress_for(as_json=False), QuietProgress)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     assert isinstance(progress_for(as_json=False), TerminalProgress)
+
+
+def test_python_shows_bars_where_it_can(monkeypatch, capsys) -> None:
+    """rich warns in a notebook without ipywidgets, and shows nothing."""
+    assert isinstance(progress_in_python(), LineProgress)
+    with monkeypatch.context() as patch:
+        patch.setattr(Console, "is_terminal", True)
+        assert isinstance(progress_in_python(), TerminalProgress)
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    for module, kind in ((None, LineProgress), (ModuleType("ipywidgets"), TerminalProgress)):
+        if module is not None:
+            module.__spec__ = ModuleSpec("ipywidgets", None)
+        monkeypatch.setitem(sys.modules, "ipywidgets", module)
+        assert isinstance(progress_in_python(), kind)
+    with LineProgress() as progress:
+        progress.stage("tracking", 2)
+        progress.note("words")
+    assert re.fullmatch(r" +0\.\d s  tracking\nnote: words\n", capsys.readouterr().err)
 
 
 def test_json_progress_reports_events(capsys) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -214,6 +215,9 @@ def test_rerun_read_by_its_reader(result: Path) -> None:
     from rerun.chunk import RrdReader
 
     (path,) = export(result, ["rerun"])
+    (entry,) = RrdReader(path).recordings()
+    # Another result of the same name is another recording in the viewer.
+    assert re.fullmatch(rf"{result.name}-[0-9a-f]{{12}}", entry.recording_id)
     columns: dict[tuple[str, str], list[Any]] = {}
     for chunk in RrdReader(path).stream():
         batch = chunk.to_record_batch()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import time
 from datetime import UTC, datetime, timedelta
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -27,7 +28,11 @@ def infrared_counts(k: int) -> UInt16:
 
 
 class FakeRealSense(ModuleType):
-    """pyrealsense2: milliseconds, metres per count, RuntimeError on failure."""
+    """pyrealsense2: milliseconds, metres per count, images that are false where they are missing.
+
+    Frame 0 has its time by the camera's clock, the others by the computer's; frame 1 lacks depth,
+    and frame 3 the infrared image.
+    """
 
     stream = SimpleNamespace(depth="depth", infrared="infrared")
     format = SimpleNamespace(z16="z16", y8="y8")
@@ -41,8 +46,12 @@ class FakeRealSense(ModuleType):
         name="name", product_line="product_line", serial_number="serial_number"
     )
 
-    def __init__(self, line: str = "L500", model: str = "none", frames: int = 5) -> None:
+    option = SimpleNamespace(global_time_enabled="global_time_enabled")
+    timestamp_domain = SimpleNamespace(hardware_clock="hardware", global_time="global")
+
+    def __init__(self, line: str = "L500", model: str = "none", frames: int = 7) -> None:
         super().__init__("pyrealsense2")
+        self.sent, self.global_time, self.settled_after = 0, 1.0, 1
         self.line, self.model, self.left = line, model, frames
         self.plugged_in = True
         self.stopped = 0
@@ -55,7 +64,16 @@ class FakeRealSense(ModuleType):
 
     def _device(self) -> Any:
         info = {"name": "Intel RealSense L515", "product_line": self.line, "serial_number": "f001"}
-        sensor = SimpleNamespace(get_depth_scale=lambda: 0.00025)
+
+        def set_option(option: str, value: float) -> None:
+            self.global_time = value
+
+        sensor = SimpleNamespace(
+            get_depth_scale=lambda: 0.00025,
+            supports=lambda option: True,
+            get_option=lambda option: self.global_time,
+            set_option=set_option,
+        )
         return SimpleNamespace(get_info=info.__getitem__, first_depth_sensor=lambda: sensor)
 
     def context(self) -> Any:
@@ -74,23 +92,30 @@ class FakeRealSense(ModuleType):
             get_stream=lambda s: SimpleNamespace(as_video_stream_profile=lambda: stream),
         )
 
-        def wait_for_frames(timeout_ms: int) -> Any:
+        def try_wait_for_frames(timeout_ms: int) -> Any:
             if self.left == 0:
-                raise RuntimeError("Frame didn't arrive within 2000")
-            self.left -= 1
-            k = 4 - self.left
+                time.sleep(timeout_ms / 1000)
+                return False, None
+            k = self.sent
+            self.left, self.sent = self.left - 1, self.sent + 1
+            by_camera = k < self.settled_after
             depth = SimpleNamespace(
-                get_data=lambda: depth_counts(k), get_timestamp=lambda: 5000.0 + 1000 / 30 * k
+                get_data=lambda: depth_counts(k),
+                get_timestamp=lambda: (0 if by_camera else 1.7e12) + 5000.0 + 1000 / 30 * k,
+                get_frame_timestamp_domain=lambda: "hardware" if by_camera else "global",
             )
             infrared = SimpleNamespace(get_data=lambda: infrared_counts(k).astype(np.uint8))
-            return SimpleNamespace(
-                get_depth_frame=lambda: depth, get_infrared_frame=lambda: infrared
+            return True, SimpleNamespace(
+                get_depth_frame=lambda: None if k == 1 else depth,
+                get_infrared_frame=lambda: None if k == 3 else infrared,
             )
 
         def stop() -> None:
             self.stopped += 1
 
-        return SimpleNamespace(start=lambda c: profile, wait_for_frames=wait_for_frames, stop=stop)
+        return SimpleNamespace(
+            start=lambda c: profile, try_wait_for_frames=try_wait_for_frames, stop=stop
+        )
 
 
 class FakeK4A(ModuleType):
@@ -129,7 +154,7 @@ class FakeK4A(ModuleType):
 
         def get_capture(timeout: int = -1) -> Any:
             if self.left == 0:
-                raise self.K4ATimeoutException
+                raise self.K4AException  # as when it is unplugged
             self.left -= 1
             k = 5 - self.left
             return SimpleNamespace(
@@ -147,7 +172,7 @@ class FakeK4A(ModuleType):
 
 
 class FakeOrbbec(ModuleType):
-    """pyorbbecsdk: mm per count, milliseconds, None if no frame arrives in time."""
+    """pyorbbecsdk: mm per count, microseconds, None if no frame arrives in time."""
 
     class OBError(Exception):
         pass
@@ -159,14 +184,14 @@ class FakeOrbbec(ModuleType):
         self.left, self.stopped, self.infrared = frames, 0, infrared
         names = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
         values = (0.5, -2.6, 1.4, 0.4, -2.4, 1.4, 0.0001, -0.0002) if rational else (0.0,) * 8
-        distortion = SimpleNamespace(**dict(zip(names, values, strict=True)))
+        self.distortion = SimpleNamespace(**dict(zip(names, values, strict=True)))
         lens = SimpleNamespace(width=WIDTH, height=HEIGHT, fx=30.0, fy=30.5, cx=15.5, cy=12.0)
         self.profile = SimpleNamespace(
             get_width=lambda: WIDTH,
             get_height=lambda: HEIGHT,
             get_fps=lambda: 30,
             get_intrinsic=lambda: lens,
-            get_distortion=lambda: distortion,
+            get_distortion=lambda: self.distortion,
         )
 
     def Config(self) -> Any:
@@ -206,7 +231,7 @@ class FakeOrbbec(ModuleType):
             get_height=lambda: HEIGHT,
             get_data=lambda: np.frombuffer(counts.tobytes(), np.uint8),
             get_depth_scale=lambda: 0.5,
-            get_timestamp=lambda: 700.0 + 1000 / 30 * k,
+            get_timestamp_us=lambda: 700_000 + round(1e6 / 30 * k),
         )
 
 

@@ -111,6 +111,10 @@ def test_command_writes_the_same_recording_and_refuses_what_phones_lack(tmp_path
     ]  # fmt: skip
     with pytest.raises(InputError, match="mirror"):
         simulate_to("rail", tmp_path / "b", camera="phone", mirror=(1.0, 1.0))
+    with pytest.raises(InputError, match="sigma: the scene room doesn't have this; omit it"):
+        simulate_to("room", tmp_path / "b", sigma=0.1)
+    with pytest.raises(InputError, match="imu: the scene peaks doesn't have this"):
+        simulate_to("peaks", tmp_path / "b", imu=True)
     with pytest.raises(InputError, match="no error called 'rain'"):
         simulate_to("rail", tmp_path / "b", camera="phone", without=("rain",))
     with pytest.raises(InputError, match="the camera stands"):

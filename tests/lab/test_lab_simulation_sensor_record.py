@@ -46,6 +46,7 @@ def test_written_folder_matches_recording_in_memory(folder) -> None:
     assert not source.warnings
     for key, value in memory.metadata.items():
         assert source.metadata[key] == value
+    assert source.metadata["sensor"] == "sr4000 (simulated)"
 
 
 def test_ground_truth_poses_are_exact(folder) -> None:

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 from importlib.machinery import ModuleSpec
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -43,7 +43,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Install:
             module.__spec__ = ModuleSpec(module.__name__, None)
             monkeypatch.setitem(sys.modules, module.__name__, module)
 
-    monkeypatch.setattr("tofuse.apps.live.devices.orbbec.TIMEOUT_S", 0.05)
+    monkeypatch.setattr("tofuse.apps.live.device.TIMEOUT_S", 0.05)
     return put
 
 
@@ -56,17 +56,42 @@ def test_realsense_stream(install: Install) -> None:
     package = FakeRealSense()
     install(package)
     with device_named("realsense", {}).open() as stream:
-        frames = [stream.read(k) for k in range(3)]
+        frames = [stream.read(k) for k in range(3)]  # the third to fifth that arrived
         with pytest.raises(DeviceError, match="sent no frame"):
             list(stream)
     assert package.stopped == 1
     assert package.enabled == ["depth", "infrared"]
     assert stream.settings.sensor == "Intel RealSense L515"
     assert stream.settings.camera == Pinhole(WIDTH, HEIGHT, 30.0, 31.0, 15.2, 11.9)
-    check_depth(frames[2], 2, 0.00025)
-    assert np.array_equal(frames[2].amplitude_image, infrared_counts(2))
-    assert frames[1].timestamp - frames[0].timestamp == pytest.approx(1 / 30)
+    check_depth(frames[2], 5, 0.00025)
+    assert not frames[0].amplitude_image.any()
+    assert np.array_equal(frames[2].amplitude_image, infrared_counts(5))
+    assert frames[1].timestamp - frames[0].timestamp == pytest.approx(1 / 30, abs=1e-5)
+    assert frames[0].timestamp > 1.7e9  # by the computer's clock
     assert frames[0].depth_kind == "z"
+
+
+def test_realsense_keeps_the_clock_that_its_first_frames_have(
+    install: Install, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tofuse.apps.live.devices.realsense._CLOCK_S", 0.0)
+    package = FakeRealSense()
+    install(package)
+    with device_named("realsense", {}).open():
+        assert package.global_time == 0
+
+
+def test_only_the_first_frame_may_take_long(
+    install: Install, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(FakeOrbbec(frames=0))
+    device = device_named("orbbec", {})
+    monkeypatch.setattr(device.stream, "timeout_s", 0.1)
+    with pytest.raises(DeviceError, match=r"Orbbec: sent no frame for 0\.1 s"):
+        device.open()
+    install(FakeOrbbec())
+    with device.open() as stream:
+        assert stream.timeout_s == 0.05
 
 
 def test_realsense_errors_are_reported(install: Install) -> None:
@@ -100,6 +125,11 @@ def test_azure_kinect_stream(install: Install) -> None:
         30.0, 12.0, 0.5, -0.0002, 1.4, 1.4,
     )  # fmt: skip
     assert package.stopped == 1
+    with (
+        device_named("azure-kinect", {}).open() as stream,
+        pytest.raises(DeviceError, match=r"stopped \(K4AException: \); check its cable"),
+    ):
+        list(stream)  # unplugged after its last frame
     with pytest.raises(DeviceError, match="does not start"):
         device_named("azure-kinect", {"device": "1"}).open()
     with pytest.raises(DeviceError, match="use 5, 15 or 30"):
@@ -118,7 +148,14 @@ def test_orbbec_stream(install: Install) -> None:
     camera = stream.settings.camera
     assert isinstance(camera, Rational)
     assert (camera.k1, camera.p1, camera.k3, camera.k4) == (0.5, 0.0001, 1.4, 0.4)
+    assert frame.timestamp == pytest.approx(0.7 + 2 / 30, abs=1e-6)
     assert package.stopped == 1
+    package.left, package.distortion.model = 6, SimpleNamespace(name="KANNALA_BRANDT4")
+    with pytest.raises(DeviceError, match="lens of the model KANNALA_BRANDT4"):
+        device_named("orbbec", {}).open()
+    package.left, package.distortion.model = 6, SimpleNamespace(name="BROWN_CONRADY_K6")
+    with device_named("orbbec", {}).open() as stream:
+        assert isinstance(stream.settings.camera, Rational)
 
 
 @pytest.mark.parametrize("converted", [True, False])
@@ -171,7 +208,7 @@ def test_recorded_frames_match_stream(install: Install, tmp_path: Path) -> None:
 
 
 def test_failing_camera_keeps_recorded_frames(install: Install, tmp_path: Path) -> None:
-    install(FakeRealSense(frames=4))
+    install(FakeRealSense(frames=7))
     with device_named("realsense", {}).open() as stream:
         done = record(stream, tmp_path / "a", seconds=60)
     assert done.frames == 4
@@ -184,7 +221,7 @@ def test_full_disk_keeps_recorded_frames(
     size: int, install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The files at the end need space as well, for which the last frames make room."""
-    install(FakeRealSense(frames=5))
+    install(FakeRealSense(frames=8))
 
     def limited(write: Callable[..., None]) -> Callable[..., None]:
         def written(path: Path, content: Any) -> None:
@@ -224,6 +261,21 @@ class Endless(Stream):
         pass
 
 
+def test_frame_that_does_not_fit_keeps_recorded_frames(install: Install, tmp_path: Path) -> None:
+    class LosesAmplitude(Endless):
+        def read(self, index: int) -> RangeFrame:
+            frame = super().read(index)
+            amplitude = None if index == 3 else frame.depth
+            return RangeFrame(index, frame.timestamp, frame.camera, frame.depth, "z", amplitude)
+
+    install(FakeRealSense())
+    with device_named("realsense", {}).open() as camera:
+        stream = LosesAmplitude(camera.settings, many=0)
+    done = record(stream, tmp_path / "a", frames=9)
+    assert (done.frames, "frame 3: has [] where" in done.ended_by) == (3, True)
+    assert len(tofuse.open(tmp_path / "a")) == 3
+
+
 def test_slow_disk_drops_and_counts_frames(install: Install, tmp_path: Path) -> None:
     install(FakeRealSense())
     with device_named("realsense", {}).open() as camera:
@@ -241,7 +293,10 @@ def test_slow_disk_drops_and_counts_frames(install: Install, tmp_path: Path) -> 
 
 
 def test_record_command(
-    install: Install, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    install: Install,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     install(FakeK4A())
     out = tmp_path / "rec"
@@ -249,6 +304,9 @@ def test_record_command(
     assert "2 frames in" in capsys.readouterr().out
     assert main(["inspect", str(out)]) == 0
     assert "Azure Kinect" in capsys.readouterr().out
+    monkeypatch.delitem(sys.modules, "pyk4a")  # the folder is checked before the camera
+    assert main(["record", "azure-kinect", "--out", str(out)]) == 2
+    assert f"{out}: isn't empty" in capsys.readouterr().err
     assert main(["record"]) == 0
     listed = capsys.readouterr().out
     assert all(name in listed for name in known_devices())

@@ -142,6 +142,16 @@ def test_command_writes_the_scale(tmp_path, capfd) -> None:
     np.testing.assert_allclose(aligned, moved, atol=1e-5)
 
 
+def test_large_clouds_may_be_in_mm(tmp_path, capfd) -> None:
+    for name, seed in (("source", 1), ("target", 0)):
+        for factor, unit in ((1, "m"), (1000, "mm")):
+            points = factor * stone(1000, seed, 0.001)
+            write_ply(tmp_path / f"{name}-{unit}.ply", GeometryRecord(points))
+    for unit, says in (("m", False), ("mm", True)):
+        call("register", tmp_path / f"source-{unit}.ply", tmp_path / f"target-{unit}.ply")
+        assert ("if the files are in mm" in capfd.readouterr().out) == says
+
+
 @pytest.mark.parametrize(
     ("view", "says"),
     [

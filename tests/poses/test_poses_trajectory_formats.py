@@ -136,6 +136,11 @@ BAD = {
 }
 
 
+def test_folder_without_poses_has_a_remedy(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"contains none of .*; pass a result, or a file of poses"):
+        read_poses(tmp_path)
+
+
 @pytest.mark.parametrize("name", BAD)
 def test_bad_file_is_rejected(name: str, tmp_path: Path) -> None:
     content, words = BAD[name]

@@ -215,6 +215,43 @@ def test_rotated_model_is_measured_along_its_own_sides(exact, tmp_path):
             assert float(cell.split()[0]) == pytest.approx(size, abs=0.011)
 
 
+def test_frames_without_colour_show_their_range(tmp_path):
+    """Some apps store a colour image with every fifth frame only."""
+    depth, fate = np.ones((3, 4), np.float16), np.zeros((3, 4), np.uint8)
+    colors = (None, np.full((3, 4, 3), 99, np.uint8))
+    samples = tuple(FrameSample(k, depth, fate, None, color) for k, color in enumerate(colors))
+    frames = tuple(FrameRecord(k, 0.1 * k, "tracked") for k in range(2))
+    got = page(tmp_path, lonely(samples=samples, frames=frames), ReportExtras("x"))
+    (text,) = re.findall(r'<script type="application/json" id="pictures">(.*?)</script>', got.text)
+    images = json.loads(text)["images"]
+    assert [bool(image) for image in images["color"]] == [False, True]
+    assert all(images["range"])
+    assert re.search(r'data-kind="color" src="data:,"\s+hidden', got.text)
+
+
+@pytest.mark.parametrize(
+    ("up", "turn"),
+    [
+        ((-1, 0, 0), "90"),
+        ((0.1, 1, 0), "180"),
+        ((1, 0, -1), "270"),
+        ((0, -1, 0), ""),
+        ((0, 0, 1), ""),
+    ],
+)
+def test_images_of_a_turned_camera_are_upright(up, turn, tmp_path):
+    got = page(tmp_path, lonely(up=np.array(up, float)), ReportExtras("x"))
+    assert re.findall(r"transform: rotate\((\d+)deg\)", got.text) == [turn] * bool(turn)
+
+
+def test_summary_shows_where_its_advice_applies(tmp_path):
+    frames = tuple(FrameRecord(k, 0.1 * k, "tracked") for k in range(9))
+    for ranges, links in ((((3, 4),), 1), (((0, 8),), 0)):
+        reasons = (Reason("unobserved_motion", ranges, ""),)
+        result = lonely(verdict="degraded", reasons=reasons, frames=frames)
+        assert page(tmp_path, result, ReportExtras("x")).text.count(">Show where<") == links
+
+
 def test_reasons_name_their_frames(tmp_path):
     frames = tuple(FrameRecord(k, 0.1 * k, "tracked") for k in range(90))
     reason = Reason("images_differ", ((3, 4), (20, 34), (50, 50)), "Surfaces do not agree.")

@@ -45,6 +45,13 @@ def test_cause_precedes_its_consequences(cause, advice) -> None:
     assert card(of(KNOWN, "degraded", reasons))[-1].startswith(f"to improve: {advice}")
 
 
+def test_advice_names_its_frames_unless_they_are_all() -> None:
+    last = len(result().diagnostics.frames) - 1
+    for ranges, ending in ((((0, 0),), "view there (frame 0)"), (((0, last),), "view there")):
+        reasons = (Reason("unobserved_motion", ranges, "No structure."),)
+        assert card(of(KNOWN, "degraded", reasons))[-1].endswith(ending)
+
+
 def test_unbounded_and_unassessed_accuracy() -> None:
     turned = Accuracy(position_m=0.04, rotation_rad=1.08, relative=0.008, assessed=True)
     assert bound(turned, 5.0) == "±40 mm and 62° (95 %) over 5 m, 0.8 %"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -513,9 +514,9 @@ def test_calibration_without_loop_confirmation_is_noted() -> None:
     )
     refinement = Refinement(np.zeros((9, 4, 4)), True, 9, 20, calibration_check=found)
 
-    def warnings_of(suspicion: CalibrationCheck) -> list[str]:
+    def warnings_of(suspicion: CalibrationCheck, **more: Any) -> list[str]:
         checked = replace(refinement, calibration_check=suspicion)
-        case = evidence(gaps=(), sigma=(0.001, 0.001), refinement=checked)
+        case = evidence(gaps=(), sigma=(0.001, 0.001), refinement=checked, **more)
         return [r.text for r in judge(case)[1] if r.code == "unchecked_calibration"]
 
     (text,) = warnings_of(found)
@@ -523,6 +524,10 @@ def test_calibration_without_loop_confirmation_is_noted() -> None:
     (text,) = warnings_of(UNDETERMINED)
     assert "does not determine the camera's focal length" in text
     assert text.endswith("allows for an error of 1 %. It would move the poses by 30 mm.")
+    (text,) = warnings_of(UNDETERMINED, priors=(SensorRecord("odometry", 8, 8, 1.0, ""),))
+    assert text.endswith(
+        "by 30 mm, but the recorded odometry, or the device's own poses, limit that."
+    )
     # Another error is named where it would move the poses more, and limits the bound.
     off_center = replace(UNDETERMINED, motion={"focal": (3.0, 0.2), "center_x": (5.0, 0.2)})
     (text,) = warnings_of(off_center)

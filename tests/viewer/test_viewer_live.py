@@ -65,6 +65,9 @@ def test_live_view_shows_advice_until_tracking_ends(room_recording, monkeypatch)
         np.testing.assert_allclose(arrow.points[0, 1], [0, 0, -0.5], atol=1e-6)
         np.testing.assert_allclose(np.abs(target.wxyz), [0, 0, 1, 0], atol=1e-9)
         live.stage("closing loops")
+        monkeypatch.setattr(live_view, "_UPDATE_PERIOD", 0.0)
+        live.advance()
+        assert live._status.content == "**closing loops** 1"
         assert live._advice.content == ""
         assert not live._advised
         assert live._so_far is None

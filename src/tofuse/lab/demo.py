@@ -111,11 +111,12 @@ def _is_simulated(folder: Path) -> bool:
     return (folder / "truth").is_dir() or not any(folder.iterdir())
 
 
-def _refuse(**options: object) -> None:
-    """Check that options are not given that the simulated phone does not have."""
+def _refuse(simulated: str, **options: object) -> None:
+    """Check that options are not given that what is simulated does not have."""
     for name, value in options.items():
         if value:
-            raise InputError("a simulated phone doesn't have this", where=name, remedy="omit it")
+            option = f"--{name.replace('_', '-')}"
+            raise InputError(f"{simulated} doesn't have this", where=option, remedy="omit it")
 
 
 # Section 4.1.6: all points, no filters; and a resolution of 1 m. Loops would be 3 m apart.
@@ -179,9 +180,16 @@ def simulate_to(
         "seed": seed, "every": every, "frames": frames, "first": first, "texture": texture
     }  # fmt: skip
     of_sensor = {"passing": passing, "mirror": mirror, "imu": imu}
+    name = "passing" if passing is None else f"with_{passing.kind}"
+    unusual = {name: passing, "mirror": mirror, "imu": imu, "no_correction": not correction}
     try:
+        if scene == "peaks":
+            lens = {"camera": camera != "sr4000", "without": without, "uniform": not texture}
+            _refuse("the scene peaks", **unusual, **lens, first=first)
+        else:
+            _refuse(f"the scene {scene}", sigma=sigma is not None)
         if camera == phone.NAME:
-            _refuse(**of_sensor, no_correction=not correction)
+            _refuse("a simulated phone", **unusual)
             errors = phone.PhoneErrors().without(*without)
             phone.write_phone(phone.plan_phone(scene, errors=errors, **options), out, report)
         else:

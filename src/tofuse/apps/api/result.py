@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import sys
 import tempfile
 import webbrowser
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,7 @@ from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from tofuse.apps.certainty import Length, LengthErrors
-from tofuse.apps.cli import TerminalProgress
+from tofuse.apps.cli import progress_in_python
 from tofuse.apps.jobs import (
     Evaluation,
     evaluate,
@@ -273,12 +272,14 @@ class Result(Reconstruction):
         from tofuse.apps.report import scene, thumbnails
 
         rows = {f.index: k for k, f in enumerate(self.diagnostics.frames)}
-        drawn = scene.make_scene(self, rows)
+        R_display_world = self.T_up_world[:3, :3] * [[1.0], [-1.0], [-1.0]]
+        drawn = scene.make_scene(self, rows).view_rotation(R_display_world)
         accuracy = html.escape(self.accuracy)
         verdict = html.escape(self.diagnostics.verdict.capitalize())
         picture = ""
         if len(drawn.points):
-            source = thumbnails.data_uri(scene.render(drawn, _THUMBNAIL))
+            image = scene.render(drawn, _THUMBNAIL, yaw=scene.opening_yaw(drawn))
+            source = thumbnails.data_uri(image)
             picture = f'<img src="{source}" alt="The model" style="border-radius:8px"><br>'
         return f"<div>{picture}<b>{verdict}</b>: {accuracy}</div>"
 
@@ -352,7 +353,7 @@ def reconstruct(
         Measurements of other sensors to use, as ``--prior`` of `tofuse run`: "auto" uses gravity,
         and a phone's own poses, "none" the images alone, "device" the recorded odometry too.
     progress
-        True: progress bars on the terminal.
+        True: progress bars on the terminal and in notebooks with ipywidgets, else a line a stage.
 
     Raises
     ------
@@ -421,7 +422,7 @@ def merge(
 
 
 def _with_terminal(progress: Progress | bool | None) -> AbstractContextManager[Progress]:
-    return TerminalProgress(sys.stderr) if progress is True else nullcontext(receiver(progress))
+    return progress_in_python() if progress is True else nullcontext(receiver(progress))
 
 
 def load(folder: str | Path, *, edited: bool = False) -> Result:

@@ -61,6 +61,9 @@ class Length:
         """The 95 % interval."""
         return max(self.length_m - self.bound_m, 0.0), self.length_m + self.bound_m
 
+    def __repr__(self) -> str:
+        return f"Length: {self}"
+
     def __str__(self) -> str:
         if not np.isfinite(self.bound_m):
             return f"{1e3 * self.length_m:.1f} mm, not bounded"

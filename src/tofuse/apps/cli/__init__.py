@@ -12,6 +12,6 @@ if TYPE_CHECKING:
     from tofuse.apps.cli import options
     from tofuse.apps.cli.commands import print_result, progress_unless_json, show
     from tofuse.apps.cli.program import console
-    from tofuse.apps.cli.progress import TerminalProgress, progress_for
+    from tofuse.apps.cli.progress import progress_for, progress_in_python
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -407,6 +407,7 @@ def record(arguments: cli.Record) -> int:
     """``tofuse record``."""
     from tofuse.apps.live import device_named, is_installed, known_devices
     from tofuse.apps.live import record as record_stream
+    from tofuse.formats.files import staging
 
     if arguments.device is None:
         table = Table("camera", "needs", "")
@@ -417,6 +418,7 @@ def record(arguments: cli.Record) -> int:
         return 0
     if arguments.out is None:
         raise InputError("is missing", where="--out", remedy="pass a new folder")
+    staging.check_new(arguments.out)  # before a camera is started
     options = dict(part.partition("=")[::2] for part in arguments.set or ())
     with (
         device_named(arguments.device, options).open() as stream,

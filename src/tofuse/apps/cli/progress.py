@@ -1,10 +1,12 @@
-"""Progress of a job on a terminal, as JSON lines, or as notes in a log."""
+"""Progress of a job on a terminal, as JSON lines, or as lines or notes in a log."""
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import math
 import sys
+import time
 from types import TracebackType
 from typing import Any, Self, TextIO
 
@@ -179,6 +181,22 @@ class QuietProgress(_Context):
         self._notes.append(text)
 
 
+class LineProgress(_Context):
+    """A line on standard error for each stage, with the time since the start."""
+
+    def __init__(self) -> None:
+        self._start = time.monotonic()
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Print the stage."""
+        seconds = time.monotonic() - self._start
+        print(f"{seconds:6.1f} s  {name}", file=sys.stderr, flush=True)
+
+    def note(self, text: str) -> None:
+        """Print a note."""
+        print(f"note: {text}", file=sys.stderr, flush=True)
+
+
 def _listen(action: str, listener: TerminalProgress) -> None:
     """Register or unregister for the compilation of kernels, where Numba is in use."""
     if numba_event := sys.modules.get("numba.core.event"):
@@ -191,6 +209,13 @@ def progress_for(*, as_json: bool) -> TerminalProgress | JsonProgress | QuietPro
     if as_json:
         return JsonProgress()
     return TerminalProgress() if sys.stderr.isatty() else QuietProgress()
+
+
+def progress_in_python() -> TerminalProgress | LineProgress:
+    """Return bars on a terminal or in a notebook that can show them, and else lines."""
+    console = Console(file=sys.stderr)
+    in_notebook = console.is_jupyter and importlib.util.find_spec("ipywidgets") is not None
+    return TerminalProgress() if console.is_terminal or in_notebook else LineProgress()
 
 
 def emit(data: dict[str, Any]) -> None:

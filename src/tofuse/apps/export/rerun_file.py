@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,11 @@ def write_rerun(scene: Scene, path: Path) -> None:
     """
     rr = reading.required_package("rerun", "rerun", "tofuse export rerun")
     views = reading.required_package("rerun.blueprint", "rerun", "tofuse export rerun")
-    recording = rr.RecordingStream("tofuse", recording_id=scene.result.resolve().name)
+    name = scene.result.resolve().name
+    # The viewer merges recordings of the same id, and many folders have the same name.
+    digest = hashlib.sha256(scene.poses.tobytes()).hexdigest()
+    recording = rr.RecordingStream("tofuse", recording_id=f"{name}-{digest[:12]}")
+    recording.send_recording_name(name)
     recording.set_log_time_enabled(False)  # of the export
     recording.set_log_tick_enabled(False)
     with atomic.replacing(path) as temporary:

@@ -119,11 +119,14 @@ def difference(estimate: Float64, reference: Float64) -> str | None:
     remaining = np.linalg.norm(t_reference - scale * t), np.linalg.norm(t_reference - t)
     factor, larger = max((1 / scale, "estimate"), (scale, "reference"))
     has_shape = remaining[0] <= _MAX_SHAPE_ERROR * np.linalg.norm(t_reference)
+    shown = f"{factor:.3g}" if factor > 1.05 else f"{factor:.4g}"
     if remaining[0] > _MAX_REMAINING * remaining[1] or not (has_shape or factor > _MIN_UNIT):
+        return None
+    if shown == "1":  # equal trajectories differ by rounding
         return None
     unit = next((u for u, f in _UNITS.items() if 1 / _MIN_FIT < factor / f < _MIN_FIT), None)
     return (
-        f"the {larger} is {factor:.3g} times as large as the other trajectory"
+        f"the {larger} is {shown} times as large as the other trajectory"
         + (f", as if it were in {unit}" if unit else "")
         + f": in the same scale the ATE would be {remaining[0] / np.sqrt(len(t)):.4f} m"
     )

@@ -18,12 +18,15 @@ from tofuse.engine.frames import Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number
 from tofuse.engine.quality import map_agreement, trajectory_errors
+from tofuse.engine.quantities import percent
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.sensor import CameraErrors, Corrector
 from tofuse.engine.times import MAX_GAP_S
 from tofuse.formats.files import reading
 from tofuse.formats.poses import Clock, TimedPoses, associated_poses, read_poses
 from tofuse.formats.recordings import open_recording, read_reference
+
+_MIN_INLIERS = 0.5  # most points of images of the same place agree; real ones by 80 % and more
 
 Poses = str | Path | Float64 | Reconstruction | Recording
 
@@ -164,6 +167,11 @@ def evaluate(
         consistency = map_agreement.map_consistency(
             recording, frame_poses, correctors=_correctors(estimate, of_estimate, config)
         )
+        if consistency.inlier_ratio < _MIN_INLIERS:
+            notes.append(
+                f"only {percent(consistency.inlier_ratio)} of the points of the images agree at "
+                f"these poses: they are far off, or {recording.path} is another recording"
+            )
     return Evaluation(error, interval, consistency, tuple(notes))
 
 

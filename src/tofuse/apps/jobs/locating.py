@@ -62,6 +62,11 @@ class LocatedFrame:
     location: locating.Location | None
     reason: str
 
+    def __repr__(self) -> str:
+        place = self.location and np.round(self.location.T_map_camera[:3, 3], 3).tolist()
+        found = f"at {place} m" if place else "without a pose"
+        return f"LocatedFrame {self.index}: {found}, {self.reason or 'accepted'}"
+
     @property
     def accepted(self) -> bool:
         """Whether the frame has an accepted pose."""

@@ -10,7 +10,6 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.apps.live.device import (
-        TIMEOUT_S,
         Device,
         DeviceError,
         Settings,
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
         device_named,
         is_installed,
         known_devices,
-        no_frame,
     )
     from tofuse.apps.live.recorder import record
 

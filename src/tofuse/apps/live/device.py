@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from time import monotonic
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,8 +22,8 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.engine.parts import discover, from_dict, name_of, registered
 
-TIMEOUT_S = 2.0  # without a frame until a camera counts as stopped
-
+# Time without a frame until a camera counts as stopped; before the first, it warms up.
+TIMEOUT_S, START_TIMEOUT_S = 2.0, 15.0
 
 # How options that are not text are written.
 _WORDS: dict[Any, str] = {bool: "true|false", int: "-?[1-9][0-9]*|0"}
@@ -67,11 +68,15 @@ class Stream(AbstractContextManager["Stream"], ABC):
     ----------
     settings
         Available when the stream is opened.
+    timeout_s
+        Time to wait for the next frame.
     """
 
     settings: Settings
+    timeout_s: float = START_TIMEOUT_S
 
     def __init__(self, options: Device) -> None:
+        self._maker = options.maker
         pip, module = options.package
         try:
             package = importlib.import_module(module)
@@ -89,7 +94,7 @@ class Stream(AbstractContextManager["Stream"], ABC):
             raise DeviceError(
                 f"does not start ({type(error).__name__}: {error})",
                 where=options.maker,
-                remedy="check that it is connected, and not used by another program",
+                remedy="check its cable, that no other program uses it, and the values of --set",
             ) from error
         try:
             self.settings = self.read_settings()
@@ -117,8 +122,35 @@ class Stream(AbstractContextManager["Stream"], ABC):
         Raises
         ------
         DeviceError
-            If none arrives within `TIMEOUT_S`.
+            If none arrives within `timeout_s`.
         """
+
+    def poll(self, timeout_s: float) -> Any:
+        """Return the next images of the maker's package; None if depth hasn't arrived in time."""
+        raise NotImplementedError
+
+    def wait(self) -> Any:
+        """Return the next images: those without depth are skipped.
+
+        Raises
+        ------
+        DeviceError
+            If none arrive within `timeout_s`, or the camera fails.
+        """
+        end = monotonic() + self.timeout_s
+        while (left := end - monotonic()) > 0:
+            try:
+                images = self.poll(left)
+            except Exception as error:  # the maker's package may raise anything
+                raise self._failed(f"stopped ({type(error).__name__}: {error})") from error
+            if images is not None:
+                self.timeout_s = TIMEOUT_S
+                return images
+        raise self._failed(f"sent no frame for {self.timeout_s:g} s")
+
+    def _failed(self, problem: str) -> DeviceError:
+        remedy = "check its cable and power supply"
+        return DeviceError(problem, where=self._maker, remedy=remedy)
 
     @abstractmethod
     def close(self) -> None:
@@ -127,7 +159,9 @@ class Stream(AbstractContextManager["Stream"], ABC):
     def frame(
         self, index: int, seconds: float, counts: NDArray[Any], infrared: NDArray[Any] | None
     ) -> RangeFrame:
-        """Return a frame of z depths in counts, and of the infrared image if there is one."""
+        """Return a frame of z depths in counts, and infrared: zeros if it alone is missing."""
+        if infrared is None and self.settings.amplitude_kind is not None:
+            infrared = np.zeros_like(counts)
         return RangeFrame(
             index,
             seconds,
@@ -212,12 +246,3 @@ def known_devices() -> dict[str, type[Any]]:
 def is_installed(device: type[Any]) -> bool:
     """Return whether the maker's package can be found."""
     return importlib.util.find_spec(device.package[1]) is not None
-
-
-def no_frame(sensor: str) -> DeviceError:
-    """Return the error of a camera that sends no frames."""
-    return DeviceError(
-        f"sent no frame for {TIMEOUT_S:g} s",
-        where=sensor,
-        remedy="check its cable and power supply",
-    )

@@ -96,7 +96,7 @@ def record(
                 break
             try:
                 writer.add(frame)
-            except OutputError as error:
+            except TofuseError as error:
                 failure = error
                 break
             if progress is not None:

@@ -13,6 +13,7 @@ from tofuse.engine.quantities import percent, probability
 
 _MIN_AXIS_COSINE = 0.985  # minimum cosine to an axis for a direction to be named after it
 _SMALL_RAD = 1e-6
+_LARGE_M = 100.0  # more than what cameras scan, and less than things of a decimetre in mm
 
 
 def decision(result: PairResult) -> tuple[str, str]:
@@ -61,6 +62,10 @@ def lines(result: PairResult) -> list[tuple[str, str]]:
     if result.registration.believed is None:
         note += "; from point noise only, usually too small"
     found.append(("sigma", f"{sigma(result)} ({note})"))
+    extent = np.linalg.norm(np.ptp(result.source.frame.points, axis=0))
+    if extent > _LARGE_M:
+        doubtful = f"m, by which the source extends over {extent:.0f} m"
+        found.append(("unit", f"{doubtful}; if the files are in mm, all lengths are thousandths"))
     if free := unobservable(result):
         found.append(("unobservable", f"{free} (axes of the source)"))
     if rival := runner_up(result):

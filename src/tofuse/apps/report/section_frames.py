@@ -115,7 +115,7 @@ def _player(s: Subject) -> Values | None:
     trim_memory()
     records = {r.index: r for r in s.result.diagnostics.frames}
     listed = [records.get(p.index) for p in samples]
-    kinds = {kind: title for kind, title in _KINDS.items() if kind in images[0]}
+    kinds = {k: title for k, title in _KINDS.items() if any(k in each for each in images)}
     note = f"Range from dark ({quantities.length(low)}) to bright ({quantities.length(high)})."
     if len(samples) < len(records):
         note = f"{len(samples):,} of {len(records):,} frames have images here. " + note
@@ -124,7 +124,7 @@ def _player(s: Subject) -> Values | None:
             "index": [p.index for p in samples],
             "descriptions": [frame_text(r, s.result.components) if r else "" for r in listed],
             "status": [r.status if r else "" for r in listed],
-            "images": {kind: [each.get(kind, "data:,") for each in images] for kind in kinds},
+            "images": {kind: [each.get(kind, "") for each in images] for kind in kinds},
         },
         "kinds": kinds,
         "note": note,

@@ -74,6 +74,7 @@ def sections(result: Reconstruction, extras: ReportExtras) -> Values:
         shown = [(name, title) for name, title, _ in listed if contents[name] is not None]
         return {
             "title": extras.title,
+            "turn": subject.image_turn,
             "result": result,
             "contents": [("model", "Model"), *shown, ("reading", "How to read this")],
             **model.result(),
@@ -89,6 +90,7 @@ def _verdict(s: Subject) -> Values:
     findings = words.findings(d.reasons, len(d.frames))
     # On this page the inspection is out of sight, so its findings stand here.
     faults = " ".join(r.text for r in d.reasons if r.code == "faulty_recording")
+    advice, where = accuracy_card.advice(d)
     return {
         "headline": s.extras.headline,
         "bound": accuracy_card.bound(a, s.result.cloud.diagonal_m).removeprefix("accuracy "),
@@ -96,7 +98,8 @@ def _verdict(s: Subject) -> Values:
         "frames": frames,
         "plain": _plain(s),
         "outcome": _OUTCOMES[d.verdict],
-        "advice": "" if d.verdict == "good" else faults or accuracy_card.advice(d.reasons),
+        "advice": advice and (faults or advice),
+        "where": where,
         "card_tone": d.verdict if d.accuracy.assessed else "",
         "tone": d.verdict,
         "posed": int(s.result.has_pose.sum()),

@@ -22,6 +22,7 @@ ROWS = 150  # maximum in a table
 _ANGLES = np.arange(-44.5, 45.5, 0.5)[:, None]  # degrees
 _MIN_BOX_FILL = 0.9  # minimum fraction of a box in the hull of points that have its shape
 _MAX_SAMPLES = 5000  # maximum number of sampled points
+_MIN_DOWN = 0.5  # length of the mean of the vertical in the images; less if they look down, or vary
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +52,20 @@ class Subject:
     scene: Scene
     truth: Float64 | None
     R_display_world: Float64
+
+    @property
+    def image_turn(self) -> int:
+        """Degrees clockwise by which images are shown, so that those of most frames are upright.
+
+        A multiple of 90, as phones store images alike however they are held; 0 where it is open.
+        """
+        posed = finite_poses(self.result.trajectory)
+        x, y, _ = (
+            (self.R_display_world[1] @ posed[:, :3, :3]).mean(0) if len(posed) else np.zeros(3)
+        )
+        if np.hypot(x, y) < _MIN_DOWN:
+            return 0
+        return round(np.degrees(np.arctan2(x, y)) / 90) % 4 * 90
 
     @classmethod
     def of(cls, result: Reconstruction, extras: ReportExtras) -> Subject:

@@ -27,7 +27,7 @@ _FOV = 2 * float(np.arctan(0.5))  # of the camera's pyramid as drawn
 _POINTS = 4000  # of each view shown
 _CLOUDS = 120  # views shown; beyond, every second one is removed
 _MIN_DISTANCE, _MIN_ANGLE = 0.15, np.radians(8.0)  # m and rad between views that are shown
-_UPDATE_PERIOD = 0.3  # s between updates of the current frame
+_UPDATE_PERIOD = 0.3  # s between updates of the current frame, and of the count
 _IMAGE_WIDTH = 240  # px
 # Time between questions to the coach: in s, and as a multiple of what the last one took.
 _ADVICE_PERIOD, _ADVICE_SHARE = 1.0, 20.0
@@ -47,7 +47,7 @@ class LiveView(Progress):
         self._path: list[Float64] = []
         self._lock = threading.Lock()
         self._stage, self._done, self._total = "opening", 0, 0
-        self._last_update = self._next_advice = -1.0
+        self._last_update = self._last_status = self._next_advice = -1.0
         self._so_far: Callable[[], OnlineMap] | None = None
         self._advised: list[Any] = []  # what is drawn of the advice
         self._spacing = (_MIN_DISTANCE, _MIN_ANGLE)
@@ -77,6 +77,8 @@ class LiveView(Progress):
             self._done += 1
             if record is not None and record.status == "lost":
                 self._show_status(f"frame {record.index} is lost: {record.reason}")
+            elif perf_counter() - self._last_status > _UPDATE_PERIOD:
+                self._show_status()
 
     def note(self, text: str) -> None:
         """See `Progress`."""
@@ -93,7 +95,6 @@ class LiveView(Progress):
             if now - self._last_update > _UPDATE_PERIOD:
                 self._last_update = now
                 self._show_current(frame, T)
-                self._show_status()
             if self._so_far is not None and now >= self._next_advice:
                 self._advise(self._so_far(), T)
                 seconds = _ADVICE_SHARE * (perf_counter() - now)
@@ -105,9 +106,12 @@ class LiveView(Progress):
             self._status.content = f"**Finished.** [The report]({address})"
 
     def _show_status(self, detail: str = "") -> None:
+        self._last_status = perf_counter()
         words = f"**{self._stage}**"
         if self._total:
             words += f" {self._done} of {self._total}"
+        elif self._done:
+            words += f" {self._done}"
         self._status.content = f"{words}\n\n{_escaped(detail)}" if detail else words
 
     def _advise(self, so_far: OnlineMap, T: Float64) -> None:
@@ -120,7 +124,10 @@ class LiveView(Progress):
         target = advice.T_world_camera
         if target is not None:  # loops have moved the latest pose in one of the two worlds
             target = T @ se3.inverse(so_far.graph.poses[-1]) @ target
-        self._show_advice(f"**Next:** {_escaped(advice.words)}", target, T)
+        words = f"**Next:** {_escaped(advice.words)}"
+        if advice.gain_m:
+            words += "\n\n(the 95 % bound on the errors of the poses, now and after that)"
+        self._show_advice(words, target, T)
 
     def _show_advice(self, words: str, target: Float64 | None, T: Float64 | None = None) -> None:
         """Show words, and an arrow from the camera's pose T to a target."""

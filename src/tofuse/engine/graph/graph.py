@@ -107,6 +107,11 @@ class PoseGraph:
         if m and (self.edges[:, 0] == self.edges[:, 1]).any():
             raise InputError("an edge joins a vertex to itself", where="pose graph")
 
+    def __repr__(self) -> str:
+        return (
+            f"PoseGraph: {len(self.ids)} poses, {len(self.edges)} edges ({self.loop.sum()} loops)"
+        )
+
     @classmethod
     def empty(cls) -> PoseGraph:
         """Return a graph without vertices."""

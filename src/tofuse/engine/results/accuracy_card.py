@@ -10,7 +10,7 @@ from tofuse.engine.frames import frame_ranges
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.quantities import count, length
 from tofuse.engine.results.checks import TOLERANCE_RAD
-from tofuse.engine.results.types import Reason, Reconstruction
+from tofuse.engine.results.types import Diagnostics, Reconstruction
 from tofuse.engine.results.verdicts import ADVICE, ranked
 
 SEPARATOR = " · "
@@ -26,17 +26,28 @@ def card(result: Reconstruction) -> list[str]:
     parts.append(f"{int(result.has_pose.sum())} of {readable} frames, {loops}")
     if weakest := weakest_frame(d.accuracy):
         parts.append(f"weakest: {weakest}")
-    if d.verdict != "good" and (text := advice(d.reasons)):
-        parts.append(f"to improve: {text[0].lower()}{text[1:].rstrip('.')}")
+    text, ranges = advice(d)
+    if text:
+        where = f" ({frame_ranges.in_words(ranges)})" if ranges else ""
+        parts.append(f"to improve: {text[0].lower()}{text[1:].rstrip('.')}{where}")
     return parts
 
 
-def advice(reasons: Sequence[Reason]) -> str:
-    """Return the advice for the most severe reason, or for one that may cause all others."""
-    by_code = {r.code: ADVICE.get(r.code, "") for r in ranked(reasons)}
-    if "faulty_recording" in by_code:
-        return "Correct the input as the inspection proposes."
-    return by_code.get("calibration_alarm") or next(filter(None, by_code.values()), "")
+def advice(d: Diagnostics) -> tuple[str, Sequence[frame_ranges.Range]]:
+    """Return advice unless the result is good, and the frames that it is about, if not all.
+
+    It is for the most severe reason, or for one that may cause all others.
+    """
+    by_code = {r.code: r for r in ranked(d.reasons) if r.code in ADVICE}
+    if d.verdict == "good":
+        return "", ()
+    if any(r.code == "faulty_recording" for r in d.reasons):
+        return "Correct the input as the inspection proposes.", ()
+    reason = by_code.get("calibration_alarm") or next(iter(by_code.values()), None)
+    if reason is None:
+        return "", ()
+    concerns_all = frame_ranges.size(reason.ranges) >= len(d.frames)
+    return ADVICE[reason.code], () if concerns_all else reason.ranges
 
 
 def bound(accuracy: pose_accuracy.Accuracy, diagonal_m: float) -> str:

@@ -617,7 +617,10 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
         )
         motion = length(undetermined[name][0])
         if motion != length(0.0):  # else the views give no estimate
-            text += f" It would move the poses by {motion}."
+            text += f" It would move the poses by {motion}"
+            if any(sensor.sensor == "odometry" and sensor.used for sensor in e.priors):
+                text += ", but the recorded odometry, or the device's own poses, limit that"
+            text += "."
     elif check.unconfirmed:
         correction = calibration_check.in_words(check.unconfirmed)
         text = (

@@ -80,8 +80,8 @@ class FrameRecord:
     valid_share: float | None = None
     inlier_share: float | None = None
     rms_m: float | None = None
-    covariance: Float64 | None = None
-    unobservable: Float64 = field(default_factory=lambda: np.zeros((0, 6)))
+    covariance: Float64 | None = field(default=None, repr=False)
+    unobservable: Float64 = field(default_factory=lambda: np.zeros((0, 6)), repr=False)
     component: int | None = None
     mean_depth_m: float | None = None
 
@@ -174,6 +174,10 @@ class Diagnostics:
     accuracy: pose_accuracy.Accuracy = pose_accuracy.Accuracy()  # noqa: RUF009 - immutable
     calibrated: SelfCalibration | None = None
     joins: tuple[Join, ...] = ()
+
+    def __repr__(self) -> str:
+        codes = [reason.code for reason in self.reasons]
+        return ", ".join((f"Diagnostics: {self.verdict}", f"{len(self.frames)} frames", *codes))
 
 
 @dataclass(frozen=True, eq=False)

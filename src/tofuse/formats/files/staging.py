@@ -156,13 +156,15 @@ def new_folder(path: str | Path) -> Iterator[Path]:
     OutputError
         If `path` exists and is not an empty folder, or can't be written.
     """
-
-    def check(folder: Path) -> None:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise OutputError("isn't empty", where=path, remedy="choose a new folder")
-
-    with replacing_folder(path, check) as folder:
+    with replacing_folder(path, check_new) as folder:
         yield folder
+
+
+def check_new(path: str | Path) -> None:
+    """Raise OutputError if `path` exists and is not an empty folder."""
+    folder = Path(path)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError("isn't empty", where=path, remedy="choose a new folder")
 
 
 def replace_folder(new: Path, path: Path, kept: str | None = None) -> None:

@@ -113,7 +113,11 @@ def read_poses(path: str | Path) -> TimedPoses:
     if reading.is_folder(path):
         file = next((path / name for name in NAMES if reading.is_file(path / name)), None)
         if file is None:
-            raise InputError(f"contains none of {', '.join(NAMES)}", where=path)
+            raise InputError(
+                f"contains none of {', '.join(NAMES)}",
+                where=path,
+                remedy=f"pass a result, or a file of poses: {_SUPPORTED}",
+            )
         path = file
     suffix = path.suffix.lower()
     if suffix == ".npy":

@@ -117,7 +117,7 @@ def switched_off(names: Sequence[str], known: Sequence[str], none: str) -> Seque
         if name not in (*known, "all"):
             raise InputError(
                 f"{none} called {name!r}",
-                where="effects",
+                where="--without",
                 remedy=f"use all, or some of {[*known]}",
             )
     return known if "all" in names else names

@@ -94,7 +94,7 @@ def hang_mirror(
             return scene.with_surface(_SILVER, face), mirror
     raise InputError(
         f"no wall in view has room for {size[0]:g} x {size[1]:g} m",
-        where="mirror",
+        where="--mirror",
         remedy="make it smaller, or simulate more of the sequence",
     )
 

@@ -296,7 +296,7 @@ def check_camera(name: str, names: Sequence[str]) -> None:
     if name not in names:
         choices = ", ".join(names)
         raise InputError(
-            f"there is no camera called {name!r}", where="camera", remedy=f"use one of {choices}"
+            f"there is no camera called {name!r}", where="--camera", remedy=f"use one of {choices}"
         )
 
 

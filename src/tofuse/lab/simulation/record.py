@@ -93,6 +93,7 @@ class RecordingPlan:
         """What camera.json says of the images."""
         model = self.model
         return {
+            "sensor": f"{model.name} (simulated)",
             "frame_rate_hz": self.sequence.frame_rate_hz,
             "ambiguity_m": model.ambiguity_m,
             "confidence_max": model.confidence_max,
@@ -284,7 +285,7 @@ def write(
 
 
 def _write_peaks(out: Path, recording: Recording) -> Path:
-    writer = RecordingWriter(out, None)
+    writer = RecordingWriter(out, None, sensor="peaks (simulated)")
     for frame in recording:
         writer.add(frame)
     T_camera_object = se3.inverse(peaks_cameras()[0])

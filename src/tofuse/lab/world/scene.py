@@ -279,7 +279,7 @@ class Sequence:
                 raise InputError(f"is {value}", where=name, remedy="use 1 or more")
         if not 0 <= first < self.frames:
             raise InputError(
-                f"is {first}", where="first", remedy=f"use one from 0 to {self.frames - 1}"
+                f"is {first}", where="--first", remedy=f"use one from 0 to {self.frames - 1}"
             )
         return np.arange(first, self.frames, stride)[:frames]
 

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from tofuse.apps.live import TIMEOUT_S, Device, DeviceError, Settings, Stream, no_frame
+from tofuse.apps.live import Device, DeviceError, Settings, Stream
 from tofuse.engine.cameras import Rational
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
@@ -39,7 +39,7 @@ class AzureKinectStream(Stream):
     def read_settings(self) -> Settings:
         """See `Stream.read_settings`."""
         # The image size of the mode is not part of the calibration, so it is taken from a frame.
-        rows, columns = self._capture().depth.shape
+        rows, columns = self.wait().depth.shape
         lens, sensor = self._device.calibration, self._k4a.CalibrationType.DEPTH
         K = np.asarray(lens.get_camera_matrix(sensor), float)
         k = np.asarray(lens.get_distortion_coefficients(sensor), float)
@@ -48,23 +48,20 @@ class AzureKinectStream(Stream):
 
     def read(self, index: int) -> RangeFrame:
         """See `Stream.read`."""
-        capture = self._capture()
+        capture = self.wait()
         return self.frame(index, capture.depth_timestamp_usec / 1e6, capture.depth, capture.ir)
 
     def close(self) -> None:
         """See `Stream.close`."""
         self._device.stop()
 
-    def _capture(self) -> Any:
-        """Wait for a capture with depth: some have only infrared."""
-        for _ in range(8):
-            try:
-                capture = self._device.get_capture(timeout=int(TIMEOUT_S * 1000))
-            except (self._k4a.K4AException, self._k4a.K4ATimeoutException) as error:
-                raise no_frame("Azure Kinect") from error
-            if capture.depth is not None:
-                return capture
-        raise no_frame("Azure Kinect")
+    def poll(self, timeout_s: float) -> Any:
+        """See `Stream.poll`."""
+        try:
+            capture = self._device.get_capture(timeout=int(timeout_s * 1000))
+        except self._k4a.K4ATimeoutException:
+            return None
+        return None if capture.depth is None else capture
 
 
 @part("device", "azure-kinect")

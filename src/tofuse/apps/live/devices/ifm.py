@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.apps.live import TIMEOUT_S, Device, Settings, Stream, no_frame
+from tofuse.apps.live import Device, Settings, Stream
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
 from tofuse.formats.readers import head_camera, head_frame, read_info
@@ -34,7 +34,7 @@ class IfmO3rStream(Stream):
 
     def read_settings(self) -> Settings:
         """See `Stream.read_settings`."""
-        frame = self._wait()
+        frame = self.wait()
         info = bytes(frame.get_buffer(self._id.TOF_INFO))
         self._info = read_info(info, "ifm O3R: TOF_INFO")
         height, width = self._buffer(frame, "RADIAL_DISTANCE_IMAGE").shape
@@ -44,7 +44,7 @@ class IfmO3rStream(Stream):
 
     def read(self, index: int) -> RangeFrame:
         """See `Stream.read`."""
-        frame = self._wait()
+        frame = self.wait()
         return head_frame(
             index,
             frame.timestamps()[0].timestamp(),
@@ -60,11 +60,10 @@ class IfmO3rStream(Stream):
         """See `Stream.close`."""
         self._grabber.stop().wait()
 
-    def _wait(self) -> Any:
-        arrived, frame = self._grabber.wait_for_frame().wait_for(int(TIMEOUT_S * 1000))
-        if not arrived:
-            raise no_frame("ifm O3R")
-        return frame
+    def poll(self, timeout_s: float) -> Any:
+        """See `Stream.poll`."""
+        arrived, frame = self._grabber.wait_for_frame().wait_for(int(timeout_s * 1000))
+        return frame if arrived else None
 
     def _buffer(self, frame: Any, name: str) -> NDArray[Any]:
         return np.asarray(frame.get_buffer(getattr(self._id, name)))

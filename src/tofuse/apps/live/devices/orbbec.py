@@ -1,21 +1,21 @@
-"""Orbbec's cameras (Femto, Gemini, Astra), by the package pyorbbecsdk."""
+"""Orbbec's cameras (Femto, Gemini, Astra), by the package pyorbbecsdk, of version 1 or 2."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from time import monotonic
 from typing import Any, ClassVar
 
 import numpy as np
 
-from tofuse.apps.live import TIMEOUT_S, Device, DeviceError, Settings, Stream, no_frame
+from tofuse.apps.live import Device, DeviceError, Settings, Stream
 from tofuse.engine.arrays import Float32
 from tofuse.engine.cameras import DISTORTION_ORDER
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import lenses
 
-_POLL_MS = 100
+# Models whose coefficients have other meanings than those of the rational model.
+_OTHER_LENSES = ("MODIFIED_BROWN_CONRADY", "INVERSE_BROWN_CONRADY", "KANNALA_BRANDT4")
 
 
 class OrbbecStream(Stream):
@@ -43,11 +43,18 @@ class OrbbecStream(Stream):
 
     def read_settings(self) -> Settings:
         """See `Stream.read_settings`."""
-        depth = self._frames().get_depth_frame()
+        depth = self.wait().get_depth_frame()
         lens, distortion = self._profile.get_intrinsic(), self._profile.get_distortion()
         intrinsics = {name: float(getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")}
         names = DISTORTION_ORDER["rational"]
         coefficients = {name: float(getattr(distortion, name)) for name in names}
+        model = getattr(getattr(distortion, "model", None), "name", "")  # version 1 states none
+        if any(coefficients.values()) and model in _OTHER_LENSES:
+            raise DeviceError(
+                f"has a lens of the model {model}",
+                where="Orbbec",
+                remedy="record with Orbbec's viewer, and describe the lens by --camera camera.json",
+            )
         size = _size(self._profile)
         return Settings(
             str(self._pipeline.get_device().get_device_info().get_name()),
@@ -60,30 +67,24 @@ class OrbbecStream(Stream):
 
     def read(self, index: int) -> RangeFrame:
         """See `Stream.read`."""
-        frames = self._frames()
+        frames = self.wait()
         depth = frames.get_depth_frame()
         infrared = frames.get_ir_frame() if self._infrared else None
-        image = _image(depth)
-        amplitude = np.zeros_like(image) if self._infrared else None
         return self.frame(
             index,
-            depth.get_timestamp() / 1000.0,
-            image,
-            amplitude if infrared is None else _image(infrared),
+            depth.get_timestamp_us() / 1e6,
+            _image(depth),
+            None if infrared is None else _image(infrared),
         )
 
     def close(self) -> None:
         """See `Stream.close`."""
         self._pipeline.stop()
 
-    def _frames(self) -> Any:
-        """Wait for frames with depth: a camera that is starting or disconnected returns None."""
-        end = monotonic() + TIMEOUT_S
-        while monotonic() < end:
-            frames = self._pipeline.wait_for_frames(_POLL_MS)
-            if frames is not None and frames.get_depth_frame() is not None:
-                return frames
-        raise no_frame("Orbbec")
+    def poll(self, timeout_s: float) -> Any:
+        """See `Stream.poll`."""
+        frames = self._pipeline.wait_for_frames(int(timeout_s * 1000))
+        return None if frames is None or frames.get_depth_frame() is None else frames
 
 
 @part("device", "orbbec")
@@ -98,7 +99,7 @@ class Orbbec(Device):
     """
 
     maker: ClassVar[str] = "Orbbec"
-    package: ClassVar[tuple[str, str]] = ("pyorbbecsdk", "pyorbbecsdk")
+    package: ClassVar[tuple[str, str]] = ("pyorbbecsdk2", "pyorbbecsdk")
     stream: ClassVar[type[Stream]] = OrbbecStream
     infrared: bool = True
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from time import monotonic
 from typing import Any, ClassVar
 
 import numpy as np
 
-from tofuse.apps.live import TIMEOUT_S, Device, DeviceError, Settings, Stream, no_frame
+from tofuse.apps.live import Device, DeviceError, Settings, Stream
 from tofuse.engine.cameras import BrownConrady, Camera, Pinhole
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import lenses
+
+_CLOCK_S = 1.0  # until frames have times by the computer's clock
 
 
 class RealSenseStream(Stream):
@@ -33,6 +36,7 @@ class RealSenseStream(Stream):
 
     def read_settings(self) -> Settings:
         """See `Stream.read_settings`."""
+        self._settle_clock()
         device = self._profile.get_device()
         stream = self._profile.get_stream(self._rs.stream.depth).as_video_stream_profile()
         return Settings(
@@ -46,16 +50,36 @@ class RealSenseStream(Stream):
 
     def read(self, index: int) -> RangeFrame:
         """See `Stream.read`."""
-        try:
-            frames = self._pipeline.wait_for_frames(int(TIMEOUT_S * 1000))
-        except RuntimeError as error:
-            raise no_frame(self.settings.sensor) from error
+        frames = self.wait()
         depth = frames.get_depth_frame()
-        amplitude = None
-        if self._infrared:
-            amplitude = np.asanyarray(frames.get_infrared_frame().get_data())
-        counts = np.asanyarray(depth.get_data())
-        return self.frame(index, depth.get_timestamp() / 1000.0, counts, amplitude)
+        infrared = frames.get_infrared_frame() if self._infrared else None
+        return self.frame(
+            index,
+            depth.get_timestamp() / 1000.0,
+            np.asanyarray(depth.get_data()),
+            np.asanyarray(infrared.get_data()) if infrared else None,
+        )
+
+    def poll(self, timeout_s: float) -> Any:
+        """See `Stream.poll`."""
+        arrived, frames = self._pipeline.try_wait_for_frames(int(timeout_s * 1000))
+        return frames if arrived and frames.get_depth_frame() else None  # false where missing
+
+    def _settle_clock(self) -> None:
+        """Skip the first frames, whose times may be by the camera's clock, not yet the computer's.
+
+        If that lasts, later times are by the camera's clock, too.
+        """
+        sensor, clock = self._profile.get_device().first_depth_sensor(), self._rs.timestamp_domain
+        of_computer = self._rs.option.global_time_enabled
+        if not (sensor.supports(of_computer) and sensor.get_option(of_computer)):
+            return
+        end = monotonic() + _CLOCK_S
+        while monotonic() < end:
+            depth = self.wait().get_depth_frame()
+            if depth.get_frame_timestamp_domain() != clock.hardware_clock:
+                return
+        sensor.set_option(of_computer, 0.0)
 
     def close(self) -> None:
         """See `Stream.close`."""

@@ -17,7 +17,11 @@ function startFrames(bus) {
       slider.value = String(row);
       words.textContent = pictures.descriptions[row];
       words.className = pictures.status[row];
-      for (const image of player.querySelectorAll("img")) image.src = pictures.images[image.dataset.kind][row];
+      for (const image of player.querySelectorAll("img")) {
+        const source = pictures.images[image.dataset.kind][row];
+        image.hidden = !source;  // not every frame has a colour image
+        if (source) image.src = source;
+      }
     };
     const go = (row) => choose(pictures.index[Math.max(0, Math.min(last, row))], false);
     bus.addEventListener("chosen", (e) => show(nearest(e.detail.index)));
@@ -102,7 +106,7 @@ function startFrames(bus) {
       if (e.detail.shown) inset.hidden = false;
       const row = pictures ? nearest(index) : -1, same = row >= 0 && pictures.index[row] === index;
       image.hidden = true;
-      if (row >= 0) show((pictures.images.color || pictures.images.range)[row], same);
+      if (row >= 0) show(pictures.images.color?.[row] || pictures.images.range[row], same);
       if (served) fetchLater(index);
       caption.textContent = same
         ? pictures.descriptions[row]
