@@ -67,7 +67,7 @@ QUANTITIES = {
 # Standard deviation of the errors of usual cameras, uniform up to the tolerance, which is the same
 # for all; and of one that is not usual.
 USUAL, _UNUSUAL = 0.01 / 3**0.5, 0.1
-# Logarithm of the factor by which views are likelier with an error: strong evidence (Jeffreys 1961).
+# Logarithm of the factor by which views are likelier with an error: strong evidence (Jeffreys).
 _STRONG = float(np.log(10))
 # Standard deviations by which a certain error exceeds the tolerance; and of a usual one that may
 # improve the views: worth a full estimate from this fraction of the tolerance.
