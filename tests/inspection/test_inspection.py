@@ -15,7 +15,7 @@ import pytest
 import tofuse
 from ray_casting import rays_at, to_room, to_walls
 from tofuse.apps.cli.program import main
-from tofuse.apps.inspection.channels import check_mirrored
+from tofuse.apps.inspection.channels import _log_depth, check_mirrored
 from tofuse.apps.inspection.finding import CODES, Finding
 from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.apps.inspection.planar import Distortion
@@ -321,6 +321,14 @@ def test_mirrored_color_is_detected(turn, flip, words) -> None:
     found = [f.text for f in check_mirrored(Sample.of(of(frames), 8))]
     assert len(found) == (words is not None)
     assert all(words in text for text in found)
+
+
+def test_nothing_around_an_object_has_no_edges() -> None:
+    """Its outline is no edge of depth, nor is anything outside it, however far."""
+    depth = np.zeros((72, 96), np.float32)
+    depth[20:50, 30:60] = 0.7
+    frame = RangeFrame(0, 0.0, Pinhole(96, 72, 80.0, 80.0, 47.5, 35.5), depth, "z")
+    assert np.ptp(_log_depth(frame)) < 1e-6
 
 
 def test_colors_of_other_frames_are_not_mirrored(turn) -> None:

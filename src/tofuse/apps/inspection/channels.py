@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import cv2
 import numpy as np
+from scipy import ndimage
 
 from tofuse.apps.inspection.finding import Finding, is_significant
 from tofuse.apps.inspection.sample import Sample
@@ -227,10 +228,13 @@ def _log_depth(frame: RangeFrame) -> Float32:
 
 
 def _filled(values: Float32, known: Bool) -> Float32:
-    """Values (H, W) with unknown ones filled from their surroundings, to avoid edges."""
-    weight = known.astype(np.float32)
+    """Values (H, W) with unknown ones filled by a mean around the nearest known, without edges."""
+    if not known.any():
+        return np.zeros_like(values)
+    weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), 3)
     blurred = cv2.GaussianBlur(np.where(known, values, 0).astype(np.float32), (0, 0), 3)
-    filled = blurred / np.maximum(cv2.GaussianBlur(weight, (0, 0), 3), 1e-6)
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    filled = blurred[tuple(nearest)] / weight[tuple(nearest)]
     return np.where(known, values, filled).astype(np.float32)
 
 
