@@ -15,7 +15,7 @@ import pytest
 import tofuse
 from ray_casting import rays_at, to_room, to_walls
 from tofuse.apps.cli.program import main
-from tofuse.apps.inspection.channels import _log_depth, check_mirrored
+from tofuse.apps.inspection.channels import _delay, _log_depth, check_mirrored
 from tofuse.apps.inspection.finding import CODES, Finding
 from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.apps.inspection.planar import Distortion
@@ -345,6 +345,18 @@ def test_colors_of_other_frames_are_not_mirrored(turn) -> None:
                 for k, f in enumerate(turn)
             ]
             assert not list(check_mirrored(Sample.of(of(frames), 8)))
+
+
+def test_shift_that_does_not_follow_the_motion_is_no_delay() -> None:
+    rng = np.random.default_rng(4)
+    noise = 0.2 * rng.standard_normal((16, 2))
+    varied, steady = np.zeros((2, 16, 2))
+    varied[:, 1], steady[:, 1] = np.linspace(1.3, 2.8, 16), 2.0
+    constant = np.array([0.0, 2.0]) + noise
+    assert _delay(constant, varied) is None
+    assert _delay(-2 * varied + noise, varied) == pytest.approx(2, abs=0.1)
+    # Both explain that.
+    assert _delay(constant, steady) == pytest.approx(-1, abs=0.1)
 
 
 @pytest.mark.nightly_part

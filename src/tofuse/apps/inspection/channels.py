@@ -41,6 +41,9 @@ _MIN_MOTION_PX, _MIN_DELAY_PX, _MAX_DELAY_SHIFT = 1.0, 1.5, 0.2
 # the images in which it explains the shift, up to half of it, as edges in one direction hardly
 # determine the other. Few random shifts lie as near.
 _MIN_DELAY, _MAX_DELAY, _MIN_DELAYED, _MAX_UNEXPLAINED = 0.7, 8.5, 0.6, 0.5
+# What a delay leaves unexplained of the shifts is at most this multiple of what a constant does. It
+# is less than once if the motion varies, and as much if it is steady.
+_MAX_REMAINDER = 2.0
 
 
 def check_mirrored(sample: Sample) -> Iterator[Finding]:
@@ -157,12 +160,8 @@ def check_delay(sample: Sample) -> Iterator[Finding]:
     shift, motion = shift[moves], motion[moves]
     if len(shift) < _MIN_FRAMES:
         return
-    delay = float(np.median(-(shift * motion).sum(1) / (motion * motion).sum(1)))
-    expected = -delay * motion
-    size = np.linalg.norm(expected, axis=1)
-    explained = np.linalg.norm(shift - expected, axis=1) <= _MAX_UNEXPLAINED * size
-    is_clear = np.median(size) >= _MIN_DELAY_PX and explained.mean() >= _MIN_DELAYED
-    if is_clear and _MIN_DELAY <= abs(delay) <= _MAX_DELAY:
+    delay = _delay(shift, motion)
+    if delay is not None:
         late, early = ("Amplitude", "depth") if delay > 0 else ("Depth", "amplitude")
         yield Finding(
             "delayed",
@@ -171,6 +170,25 @@ def check_delay(sample: Sample) -> Iterator[Finding]:
             "Pair the images by their time stamps, and switch off filters over time in the camera.",
             {"delay_frames": delay},
         )
+
+
+def _delay(shift: Float64, motion: Float64) -> float | None:
+    """Return the delay in frames that explains shifts (N, 2) of edges by motions (N, 2) per frame.
+
+    None without a clear one. Where things of one albedo stand upright, edges lie apart by as much
+    however the camera moves: a shift that is constant while the motion is not is no delay.
+    """
+    delay = float(np.median(-(shift * motion).sum(1) / (motion * motion).sum(1)))
+    expected = -delay * motion
+    size = np.linalg.norm(expected, axis=1)
+    remainder = np.linalg.norm(shift - expected, axis=1)
+    spread = np.linalg.norm(shift - np.median(shift, axis=0), axis=1)
+    is_clear = (
+        np.median(size) >= _MIN_DELAY_PX
+        and np.mean(remainder <= _MAX_UNEXPLAINED * size) >= _MIN_DELAYED
+        and np.median(remainder) <= _MAX_REMAINDER * np.median(spread)
+    )
+    return delay if is_clear and _MIN_DELAY <= abs(delay) <= _MAX_DELAY else None
 
 
 def _is_held(first: RangeFrame, second: RangeFrame) -> bool:
