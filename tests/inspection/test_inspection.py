@@ -331,6 +331,22 @@ def test_nothing_around_an_object_has_no_edges() -> None:
     assert np.ptp(_log_depth(frame)) < 1e-6
 
 
+def test_outline_of_a_turntable_before_nothing_is_not_mirrored() -> None:
+    """Its amplitude has an outline, which depth hasn't: turned, that lies at edges of depth."""
+    camera = Pinhole(96, 72, 80.0, 80.0, 47.5, 35.5)
+    y, x = np.mgrid[:72, :96]
+    plate = np.hypot((x - 48) / 24.4, (y - 49.8) / 11.3) < 1
+    frames = []
+    for k in range(8):
+        depth_noise, amplitude_noise = np.random.default_rng(k).standard_normal((2, 72, 96))
+        body = np.hypot((x - 46.8 - k) / 9.1, (y - 33.6) / 15.5) < 1
+        depth = np.where(body, 0.7, 0.85 - 0.004 * (y - 49.8)) + 0.002 * depth_noise
+        depth = np.where(plate | body, depth, 0).astype(np.float32)
+        light = np.where(body, 700, np.where(plate, 400, 1)) * (1 + 0.02 * amplitude_noise)
+        frames.append(RangeFrame(k, k / 10, camera, depth, "z", light.astype(np.float32)))
+    assert not list(check_mirrored(Sample.of(of(frames), 8)))
+
+
 def test_colors_of_other_frames_are_not_mirrored(turn) -> None:
     """Their edges are in the same parts of the images."""
     images = [f.color_image for f in colored(turn, 0)]

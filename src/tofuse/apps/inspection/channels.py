@@ -49,8 +49,9 @@ _MAX_REMAINDER = 2.0
 def check_mirrored(sample: Sample) -> Iterator[Finding]:
     """Check that edges of depth and amplitude (else colour) do not match better if mirrored."""
     for name, channel_of in (("amplitude", _amplitude), ("colour", _grey)):
+        # Without the outline of what has a depth, which is no edge of depth.
         images = [
-            (_oriented_edges(_log_depth(f)), image)
+            (_oriented_edges(_log_depth(f)), _filled(image, f.valid))
             for f in sample.images
             if (image := channel_of(f)) is not None
         ]
