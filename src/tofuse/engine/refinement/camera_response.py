@@ -165,10 +165,11 @@ class SharedErrors:
         return Posterior(errors, np.asarray(covariance, np.float64), float(volume - cost))
 
 
-def _dispersion(gradients: Float64, information: Float64) -> float:
-    """Ratio of the scatter of gradients (n, K) that add up to about zero to the information."""
-    scatter = len(gradients) / (len(gradients) - 1) * gradients.T @ gradients
-    return float(np.trace(np.linalg.solve(information, scatter))) / len(information)
+def _scatter(gradients: Float64) -> Float64:
+    """Return the covariance (K, K) of the sum of gradients (n, K), by how they differ."""
+    deviations = gradients - gradients.mean(0)
+    n = len(gradients)
+    return np.asarray(n / (n - 1) * deviations.T @ deviations, np.float64)
 
 
 def _sections(points: Float32) -> Intp:
@@ -279,28 +280,18 @@ class Linearised:
         information = second.sum(0) + 1e-9 * np.eye(len(gradient))
         estimate = -np.linalg.solve(information, gradient)
         of_views = _by_view(first + second @ estimate, self.state.pairs, len(self.poses))
-        sections = [_sections(view.points) for view in self.state.views]
-        of_sections = []
-        for section in range(SECTIONS):
-            part = self.state.with_points([np.flatnonzero(s == section) for s in sections])
-            part.evaluate(self.poses, self.errors, _ESTIMATE_ALL, self.state.options.rounds[-1])
-            equations = part.without_exposure(range(kernels.ERRORS))
-            first, second = self._derivatives(*equations, step, along)
-            of_sections.append(first.sum(0) + second.sum(0) @ estimate)
-        deviations = np.array(of_sections) - np.mean(of_sections, 0)
+        of_sections = self._of_sections(along, estimate)
         # A pair counts for both of its views. Noise is in both scatters, on the safe side.
-        dispersion = _dispersion(deviations, information) + 0.5 * _dispersion(of_views, information)
+        dispersion = sum(
+            weight * float(np.trace(np.linalg.solve(information, _scatter(gradients))))
+            for weight, gradients in ((0.5, of_views), (1.0, of_sections))
+        ) / len(information)
         initial = self.errors[list(errors)]
         return SharedErrors(initial, gradient, information, max(dispersion, 1.0), motion)
 
     def response_to_scales(self, profiles: Float64) -> Response:
         """Return the response to the scale of the depth by profiles (K, N) over the views."""
-        columns = np.zeros((len(self.H), kernels.ERRORS, len(profiles)))
-        of_target = profiles[:, self.state.target].T
-        # The response to the scale of the target is the remainder of that to a common one.
-        columns[:, kernels.SOURCE_SCALE] = profiles[:, self.state.source].T - of_target
-        columns[:, kernels.SCALE] = of_target
-        motion, along = self._along(columns)
+        motion, along = self._along(self._scales(profiles))
         step = self._relative(self._initial_step())
         first, second = self._derivatives(self.H, self.g, step, along)
         return Response(first, np.diagonal(second, axis1=1, axis2=2), motion)
@@ -325,6 +316,40 @@ class Linearised:
         # Both directions of a pair together.
         half = len(first) // 2
         return first[:half] + first[half:], self.curvature * (second[:half] + second[half:])
+
+    def _scales(self, profiles: Float64) -> Float64:
+        """Return errors (P, ERRORS, K) of the directed pairs: scales by profiles (K, N)."""
+        columns = np.zeros((len(self.H), kernels.ERRORS, len(profiles)))
+        of_target = profiles[:, self.state.target].T
+        # The response to the scale of the target is the remainder of that to a common one.
+        columns[:, kernels.SOURCE_SCALE] = profiles[:, self.state.source].T - of_target
+        columns[:, kernels.SCALE] = of_target
+        return columns
+
+    def section_sigma(self, profile: Float64) -> float:
+        """Standard deviation of the scale by a profile (1, N), from the scatter between sections.
+
+        An error that differs over the image is no change of the range, though with steady motion
+        views drift apart by it: what enters on one side leaves on the other.
+        """
+        _, along = self._along(self._scales(profile))
+        step = self._relative(self._initial_step())
+        first, second = (x.sum(0) for x in self._derivatives(self.H, self.g, step, along))
+        scatter = _scatter(self._of_sections(along, -first / second[0]))
+        return float(np.sqrt(scatter[0, 0]) / max(second[0, 0], 1e-12))
+
+    def _of_sections(self, along: Float64, estimate: Float64) -> Float64:
+        """Return the gradients (SECTIONS, K) of sections of the images at an estimate (K,)."""
+        step = self._relative(self._initial_step())
+        sections = [_sections(view.points) for view in self.state.views]
+        gradients = []
+        for section in range(SECTIONS):
+            part = self.state.with_points([np.flatnonzero(s == section) for s in sections])
+            part.evaluate(self.poses, self.errors, _ESTIMATE_ALL, self.state.options.rounds[-1])
+            equations = part.without_exposure(range(kernels.ERRORS))
+            first, second = self._derivatives(*equations, step, along)
+            gradients.append(first.sum(0) + second.sum(0) @ estimate)
+        return np.array(gradients)
 
     def _along(self, columns: Float64) -> tuple[Float64, Float64]:
         """Return how poses follow combinations (P, ERRORS, K) of the errors of directed pairs.
