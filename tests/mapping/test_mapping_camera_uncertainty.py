@@ -15,7 +15,7 @@ def test_estimated_errors_count_in_full_only_if_they_may_well_be_true():
     check = CalibrationCheck(
         estimates={"focal": (0.02, 0.004)}, moved=(0.03, 0.01), spread=(0.004, 0.0)
     )
-    likely = replace(check, errors={"focal": 0.02}, evidence=3.0)
+    likely = replace(check, errors={"focal": 0.02})
     m, rad = pose_errors(check, [])
     assert m**2 == pytest.approx(0.03**2 / 3 + 0.004**2)
     assert rad == pytest.approx(0.01 / 3**0.5)

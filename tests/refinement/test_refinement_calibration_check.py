@@ -280,15 +280,15 @@ def test_few_views_need_larger_error() -> None:
 
 def test_certain_error_exceeds_the_tolerance_by_more_than_its_uncertainty() -> None:
     certain, possible = (
-        CalibrationCheck(errors={"offset": 0.05}, evidence=3.0, estimates={"offset": (0.05, sigma)})
+        CalibrationCheck(errors={"offset": 0.05}, estimates={"offset": (0.05, sigma)})
         for sigma in (0.01, 0.02)
     )
     assert certain.unconfirmed == {"offset": 0.05}
     assert possible.is_likely
     assert not possible.unconfirmed
-    doubtful = replace(certain, evidence=1.0)
-    assert not doubtful.is_likely
-    assert replace(doubtful, support=(0.8, 0.81)).is_likely
+    usual = replace(possible, errors={})
+    assert not usual.is_likely
+    assert replace(usual, support=(0.8, 0.81)).is_likely
 
 
 def test_correction_must_close_the_loop():

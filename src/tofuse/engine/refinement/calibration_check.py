@@ -112,8 +112,6 @@ class CalibrationCheck:
     errors
         The error that is not usual, by its name, as in `Refinement.errors`; empty if there is none.
         It is a proposal and changes nothing.
-    evidence
-        Logarithm of the factor by which the views are likelier with it.
     support
         Mean support of the views without and with all errors as estimated in full, see
         `joint_alignment.Support`; None if they were not.
@@ -139,7 +137,6 @@ class CalibrationCheck:
 
     alarm: bool = False
     errors: dict[str, float] = field(default_factory=dict)
-    evidence: float = 0.0
     support: tuple[float, float] | None = None
     gap: Gap | None = None
     estimates: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -189,8 +186,8 @@ class CalibrationCheck:
 
     @property
     def is_supported(self) -> bool:
-        """Whether the views agree better with the estimates, or clearly show an unusual error."""
-        return self.improves or (bool(self.errors) and self.evidence > _STRONG)
+        """Whether the views agree better with the estimates, or show an unusual error."""
+        return self.improves or bool(self.errors)
 
     @property
     def improves(self) -> bool:
@@ -240,9 +237,8 @@ class _Estimate:
         (K, N, 6) twists by which the poses follow, per unit of each error.
     prior_weight
         Factor of the priors of the errors in reweighted least squares.
-    unusual, evidence
-        Name of the error that is not usual, empty if all are; and the logarithm of the factor by
-        which the views are likelier with it.
+    unusual
+        Name of the error that is not usual, empty if all are.
     """
 
     poses: Float64
@@ -250,7 +246,6 @@ class _Estimate:
     follow: Float64
     prior_weight: float
     unusual: str
-    evidence: float
 
     @classmethod
     def of(cls, linearised: Linearised) -> _Estimate:
@@ -258,9 +253,10 @@ class _Estimate:
         shared = linearised.shared_errors(list(_INDEX.values()))
         models = {name: shared.posterior(_sigmas(name)) for name in ("", *_INDEX)}
         best = max(models, key=lambda name: models[name].evidence)
-        evidence = models[best].evidence - models[""].evidence
+        if models[best].evidence - models[""].evidence < _STRONG:
+            best = ""
         weight = shared.dispersion / linearised.curvature
-        return cls(linearised.poses, models[best], shared.motion, weight, best, evidence)
+        return cls(linearised.poses, models[best], shared.motion, weight, best)
 
     @property
     def by_name(self) -> dict[str, tuple[float, float]]:
@@ -343,7 +339,6 @@ def _check_promising(
     check = replace(
         without_error,
         errors={name: estimates[name][0]} if is_large else {},
-        evidence=estimate.evidence,
         support=estimator.support_of(fit),
         estimates=estimates,
         moved=rms_motion(aligned.refined.poses, fit.poses),
