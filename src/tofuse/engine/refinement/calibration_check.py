@@ -38,11 +38,7 @@ from tofuse.engine.refinement.joint_alignment import (
     mean_support,
 )
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, loop_gap, thinned
-from tofuse.engine.refinement.range_change import (
-    RangeChange,
-    likely_change,
-    range_change,
-)
+from tofuse.engine.refinement.range_change import RangeChange, likely_change, range_change
 from tofuse.engine.refinement.split_half import rms_motion
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views import pair_equations
@@ -114,7 +110,7 @@ class CalibrationCheck:
         It is a proposal and changes nothing.
     support
         Mean support of the views without and with all errors as estimated in full, see
-        `joint_alignment.Support`; None if they were not.
+        `joint_alignment.Support`; None if they were not, or it falls.
     gap
         Closure error of the longest loop; None if there is none, or the views don't support the
         estimates.
@@ -215,12 +211,13 @@ def check_calibration(aligned: RefinedViews) -> CalibrationCheck:
     views, pairs, options = thinned(aligned.views, refined.pairs, aligned.options)
     linearised = Linearised.of(views, refined.poses, pairs, options, aligned.priors)
     first = _Estimate.of(linearised)
-    without_error = _by_first_estimate(aligned, linearised, first)
+    usual = replace(first, found=first.if_usual, unusual="")
+    without_error = _by_first_estimate(aligned, linearised, usual)
     if len(views) < _MIN_VIEWS or without_error.range_change is not None:
         return without_error
     if not first.is_promising:
         return _check_by_loop(aligned, without_error)
-    return _check_promising(aligned, first, without_error)
+    return _check_promising(aligned, _Estimator(aligned, linearised, first), without_error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,8 +228,8 @@ class _Estimate:
     ----------
     poses
         (N, 4, 4) of the views.
-    found
-        The errors, K in all.
+    found, if_usual
+        The errors, K in all: of the likelier model, and if all are usual.
     follow
         (K, N, 6) twists by which the poses follow, per unit of each error.
     prior_weight
@@ -243,6 +240,7 @@ class _Estimate:
 
     poses: Float64
     found: Posterior
+    if_usual: Posterior
     follow: Float64
     prior_weight: float
     unusual: str
@@ -256,7 +254,7 @@ class _Estimate:
         if models[best].evidence - models[""].evidence < _STRONG:
             best = ""
         weight = shared.dispersion / linearised.curvature
-        return cls(linearised.poses, models[best], shared.motion, weight, best)
+        return cls(linearised.poses, models[best], models[""], shared.motion, weight, best)
 
     @property
     def by_name(self) -> dict[str, tuple[float, float]]:
@@ -303,7 +301,7 @@ class _Estimate:
 def _by_first_estimate(
     aligned: RefinedViews, linearised: Linearised, first: _Estimate
 ) -> CalibrationCheck:
-    """Return what is known of the camera before any error is estimated in full."""
+    """Return what is known of a usual camera before its errors are estimated in full."""
     if len(aligned.views) < _MIN_VIEWS:
         return CalibrationCheck(motion=first.motion)
     check = CalibrationCheck(
@@ -328,18 +326,20 @@ def _by_first_estimate(
 
 
 def _check_promising(
-    aligned: RefinedViews, first: _Estimate, without_error: CalibrationCheck
+    aligned: RefinedViews, estimator: _Estimator, without_error: CalibrationCheck
 ) -> CalibrationCheck:
     """Estimate the errors in full, and check whether views, loops and odometry confirm them."""
-    estimator = _Estimator(aligned, first)
     fit = estimator.estimate()
+    support = estimator.support_of(fit)
+    if support[1] < support[0]:  # the first estimate led astray
+        return _check_by_loop(aligned, without_error)
     estimate = _Estimate.of(_linearised(fit, aligned.priors))
     name, estimates = estimate.unusual, estimate.by_name
     is_large = name != "" and abs(estimates[name][0]) > TOLERANCES[name]
     check = replace(
         without_error,
         errors={name: estimates[name][0]} if is_large else {},
-        support=estimator.support_of(fit),
+        support=support,
         estimates=estimates,
         moved=rms_motion(aligned.refined.poses, fit.poses),
         spread=estimate.spread,
@@ -359,19 +359,24 @@ def _check_promising(
 class _Estimator:
     """Estimates all errors from refined views: the overlaps are fixed, the poses are free.
 
-    Of many pairs, a part is used. Estimates start from the first ones, unless these are so large
-    that the overlaps of the views may be wrong.
+    Estimates start from the first ones, unless these are so large that the overlaps of the views
+    may be wrong.
     """
 
-    def __init__(self, aligned: RefinedViews, first: _Estimate) -> None:
-        refined, priors = aligned.refined, aligned.priors
-        views, pairs, thinned_options = thinned(aligned.views, refined.pairs, aligned.options)
+    def __init__(self, aligned: RefinedViews, linearised: Linearised, first: _Estimate) -> None:
+        refined, state = aligned.refined, linearised.state
+        self._views, self._first = state.views, first
+        self._options = replace(state.options, rounds=COARSE_TO_FINE[-1:])
+        self._align = partial(
+            align_views,
+            state.views,
+            priors=aligned.priors,
+            pairs=state.pairs,
+            scales=refined.scales,
+        )
+        self._witness = aligned.priors.witness
         # An estimate of camera errors does not model errors that patches share, so it can't be
         # compared with the refined poses.
-        self._views, self._first = views, first
-        self._options = replace(thinned_options, rounds=COARSE_TO_FINE[-1:])
-        self._align = partial(align_views, views, priors=priors, pairs=pairs, scales=refined.scales)
-        self._witness = priors.witness
         self._poses = self._align(refined.poses, replace(self._options, rounds=_REALIGNMENT)).poses
 
     def estimate(self) -> AlignedViews:
