@@ -15,7 +15,7 @@ import pytest
 import tofuse
 from ray_casting import rays_at, to_room, to_walls
 from tofuse.apps.cli.program import main
-from tofuse.apps.inspection.channels import check_mirrored
+from tofuse.apps.inspection.channels import _delay, _log_depth, check_mirrored
 from tofuse.apps.inspection.finding import CODES, Finding
 from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.apps.inspection.planar import Distortion
@@ -323,6 +323,30 @@ def test_mirrored_color_is_detected(turn, flip, words) -> None:
     assert all(words in text for text in found)
 
 
+def test_nothing_around_an_object_has_no_edges() -> None:
+    """Its outline is no edge of depth, nor is anything outside it, however far."""
+    depth = np.zeros((72, 96), np.float32)
+    depth[20:50, 30:60] = 0.7
+    frame = RangeFrame(0, 0.0, Pinhole(96, 72, 80.0, 80.0, 47.5, 35.5), depth, "z")
+    assert np.ptp(_log_depth(frame)) < 1e-6
+
+
+def test_outline_of_a_turntable_before_nothing_is_not_mirrored() -> None:
+    """Its amplitude has an outline, which depth hasn't: turned, that lies at edges of depth."""
+    camera = Pinhole(96, 72, 80.0, 80.0, 47.5, 35.5)
+    y, x = np.mgrid[:72, :96]
+    plate = np.hypot((x - 48) / 24.4, (y - 49.8) / 11.3) < 1
+    frames = []
+    for k in range(8):
+        depth_noise, amplitude_noise = np.random.default_rng(k).standard_normal((2, 72, 96))
+        body = np.hypot((x - 46.8 - k) / 9.1, (y - 33.6) / 15.5) < 1
+        depth = np.where(body, 0.7, 0.85 - 0.004 * (y - 49.8)) + 0.002 * depth_noise
+        depth = np.where(plate | body, depth, 0).astype(np.float32)
+        light = np.where(body, 700, np.where(plate, 400, 1)) * (1 + 0.02 * amplitude_noise)
+        frames.append(RangeFrame(k, k / 10, camera, depth, "z", light.astype(np.float32)))
+    assert not list(check_mirrored(Sample.of(of(frames), 8)))
+
+
 def test_colors_of_other_frames_are_not_mirrored(turn) -> None:
     """Their edges are in the same parts of the images."""
     images = [f.color_image for f in colored(turn, 0)]
@@ -337,6 +361,18 @@ def test_colors_of_other_frames_are_not_mirrored(turn) -> None:
                 for k, f in enumerate(turn)
             ]
             assert not list(check_mirrored(Sample.of(of(frames), 8)))
+
+
+def test_shift_that_does_not_follow_the_motion_is_no_delay() -> None:
+    rng = np.random.default_rng(4)
+    noise = 0.2 * rng.standard_normal((16, 2))
+    varied, steady = np.zeros((2, 16, 2))
+    varied[:, 1], steady[:, 1] = np.linspace(1.3, 2.8, 16), 2.0
+    constant = np.array([0.0, 2.0]) + noise
+    assert _delay(constant, varied) is None
+    assert _delay(-2 * varied + noise, varied) == pytest.approx(2, abs=0.1)
+    # Both explain that.
+    assert _delay(constant, steady) == pytest.approx(-1, abs=0.1)
 
 
 @pytest.mark.nightly_part

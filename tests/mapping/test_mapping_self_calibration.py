@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from tofuse.engine.geometry.rays import homogeneous
 from tofuse.engine.mapping.config import changed
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
-from tofuse.engine.mapping.self_calibration import _estimated_error, self_calibrated
+from tofuse.engine.mapping.self_calibration import self_calibrated
 from tofuse.engine.progress import Silent
 from tofuse.engine.quality.pose_accuracy import Accuracy
 from tofuse.engine.quality.trajectory_errors import displacement
@@ -74,21 +73,6 @@ def test_errors_are_composed() -> None:
     again = second.camera(first.camera(CAMERA))
     for name in ("fx", "fy", "cx", "cy"):
         assert getattr(camera, name) == pytest.approx(getattr(again, name))
-
-
-@pytest.mark.parametrize("best", ["focal", "offset", "center_x"])
-def test_focal_length_and_offset_do_not_share_an_error(best: str) -> None:
-    """Each has the effect of the other: after one of them, the other stays an alarm."""
-    check = CalibrationCheck(True, {best: 0.03}, {best: 0.002}, best=best)
-    result = SimpleNamespace(
-        diagnostics=SimpleNamespace(refinement=SimpleNamespace(calibration_check=check))
-    )
-    assert _estimated_error(result, CameraErrors()) is not None
-    for applied in ({"focal": 0.1}, {"offset_m": 0.05}):
-        (name,) = applied
-        other = {"focal": "offset", "offset_m": "focal"}[name]
-        found = _estimated_error(result, CameraErrors(**applied))
-        assert (found is None) == (best == other)
 
 
 @pytest.fixture(scope="module")
@@ -216,7 +200,9 @@ def test_correct_focal_length_is_unchanged(recording) -> None:
 def assessed(result, error: float | None, bound: float, posed: int = 3, support: float = 0.5):
     """A result whose views reveal an error of the focal length."""
     found = CalibrationCheck(
-        error is not None, {"focal": error or 0.0}, {"focal": 0.001}, best="focal"
+        error is not None,
+        {"focal": error or 0.0},
+        estimates={"focal": (error or 0.0, 0.001)},
     )
     poses = np.tile(np.eye(4), (3, 1, 1))
     refinement = Refinement(poses, True, 3, 3, support=(support, 0.9), calibration_check=found)

@@ -132,9 +132,9 @@ def test_descriptor_index_finds_most_similar_views() -> None:
 def test_submaps_share_camera_errors() -> None:
     quiet, alarm = (
         CalibrationCheck(),
-        CalibrationCheck(alarm=True, errors={"focal": 0.05}, best="focal"),
+        CalibrationCheck(alarm=True, errors={"focal": 0.05}),
     )
-    other = CalibrationCheck(alarm=True, errors={"focal": 0.04}, best="focal")
+    other = CalibrationCheck(alarm=True, errors={"focal": 0.04})
     assert not combine_checks([]).alarm
     assert not combine_checks([quiet, alarm]).alarm
     assert combine_checks([quiet, alarm, other]).errors == {"focal": 0.05}

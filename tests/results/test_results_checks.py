@@ -176,12 +176,11 @@ CHANGED = Refinement(
     9,
     20,
     calibration_check=CalibrationCheck(
-        focal_sigma=0.05,
         motion={"focal": (3.0, 0.2)},
         range_change=RangeChange(0.05, 0.001, 4, 5.0),
     ),
 )
-UNDETERMINED = CalibrationCheck(focal_sigma=0.05, motion={"focal": (3.0, 0.2)})
+UNDETERMINED = CalibrationCheck(motion={"focal": (3.0, 0.2)})
 CASES = {
     "few_poses": evidence(("tracked",) + ("lost",) * 7 + ("tracked",)),
     "images_disagree": evidence(images=seen(0.2, near_share=0.9)),
@@ -510,7 +509,9 @@ def test_component_that_starts_elsewhere_is_no_jump() -> None:
 
 def test_calibration_without_loop_confirmation_is_noted() -> None:
     """Only a note: the factory calibration of a camera is usually right."""
-    found = CalibrationCheck(False, {"focal": -0.05}, {"focal": 0.003}, focal_sigma=0.003)
+    found = CalibrationCheck(
+        False, {"focal": -0.05}, support=(0.8, 0.85), estimates={"focal": (-0.05, 0.003)}
+    )
     refinement = Refinement(np.zeros((9, 4, 4)), True, 9, 20, calibration_check=found)
 
     def warnings_of(suspicion: CalibrationCheck, **more: Any) -> list[str]:
@@ -537,7 +538,7 @@ def test_calibration_without_loop_confirmation_is_noted() -> None:
     short = Gap(2, 4, (0.03, 0.02), (0.03, 0.02), 1.0, (0.003, 0.002))  # hardly changed
     assert warnings_of(replace(found, gap=short)) == warnings_of(found)
     for quiet in (
-        CalibrationCheck(focal_sigma=0.001),  # determined, and as stated
+        CalibrationCheck(estimates={"focal": (0.0, 0.001)}),  # determined, and as stated
         CalibrationCheck(),  # not asked: too few views
         replace(found, errors={"focal": -0.005}),  # within what a calibration is good to
         replace(found, gap=gap),  # a loop speaks against it

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import cv2
 import numpy as np
+from scipy import ndimage
 
 from tofuse.apps.inspection.finding import Finding, is_significant
 from tofuse.apps.inspection.sample import Sample
@@ -40,13 +41,17 @@ _MIN_MOTION_PX, _MIN_DELAY_PX, _MAX_DELAY_SHIFT = 1.0, 1.5, 0.2
 # the images in which it explains the shift, up to half of it, as edges in one direction hardly
 # determine the other. Few random shifts lie as near.
 _MIN_DELAY, _MAX_DELAY, _MIN_DELAYED, _MAX_UNEXPLAINED = 0.7, 8.5, 0.6, 0.5
+# What a delay leaves unexplained of the shifts is at most this multiple of what a constant does. It
+# is less than once if the motion varies, and as much if it is steady.
+_MAX_REMAINDER = 2.0
 
 
 def check_mirrored(sample: Sample) -> Iterator[Finding]:
     """Check that edges of depth and amplitude (else colour) do not match better if mirrored."""
     for name, channel_of in (("amplitude", _amplitude), ("colour", _grey)):
+        # Without the outline of what has a depth, which is no edge of depth.
         images = [
-            (_oriented_edges(_log_depth(f)), image)
+            (_oriented_edges(_log_depth(f)), _filled(image, f.valid))
             for f in sample.images
             if (image := channel_of(f)) is not None
         ]
@@ -156,12 +161,8 @@ def check_delay(sample: Sample) -> Iterator[Finding]:
     shift, motion = shift[moves], motion[moves]
     if len(shift) < _MIN_FRAMES:
         return
-    delay = float(np.median(-(shift * motion).sum(1) / (motion * motion).sum(1)))
-    expected = -delay * motion
-    size = np.linalg.norm(expected, axis=1)
-    explained = np.linalg.norm(shift - expected, axis=1) <= _MAX_UNEXPLAINED * size
-    is_clear = np.median(size) >= _MIN_DELAY_PX and explained.mean() >= _MIN_DELAYED
-    if is_clear and _MIN_DELAY <= abs(delay) <= _MAX_DELAY:
+    delay = _delay(shift, motion)
+    if delay is not None:
         late, early = ("Amplitude", "depth") if delay > 0 else ("Depth", "amplitude")
         yield Finding(
             "delayed",
@@ -170,6 +171,25 @@ def check_delay(sample: Sample) -> Iterator[Finding]:
             "Pair the images by their time stamps, and switch off filters over time in the camera.",
             {"delay_frames": delay},
         )
+
+
+def _delay(shift: Float64, motion: Float64) -> float | None:
+    """Return the delay in frames that explains shifts (N, 2) of edges by motions (N, 2) per frame.
+
+    None without a clear one. Where things of one albedo stand upright, edges lie apart by as much
+    however the camera moves: a shift that is constant while the motion is not is no delay.
+    """
+    delay = float(np.median(-(shift * motion).sum(1) / (motion * motion).sum(1)))
+    expected = -delay * motion
+    size = np.linalg.norm(expected, axis=1)
+    remainder = np.linalg.norm(shift - expected, axis=1)
+    spread = np.linalg.norm(shift - np.median(shift, axis=0), axis=1)
+    is_clear = (
+        np.median(size) >= _MIN_DELAY_PX
+        and np.mean(remainder <= _MAX_UNEXPLAINED * size) >= _MIN_DELAYED
+        and np.median(remainder) <= _MAX_REMAINDER * np.median(spread)
+    )
+    return delay if is_clear and _MIN_DELAY <= abs(delay) <= _MAX_DELAY else None
 
 
 def _is_held(first: RangeFrame, second: RangeFrame) -> bool:
@@ -227,10 +247,13 @@ def _log_depth(frame: RangeFrame) -> Float32:
 
 
 def _filled(values: Float32, known: Bool) -> Float32:
-    """Values (H, W) with unknown ones filled from their surroundings, to avoid edges."""
-    weight = known.astype(np.float32)
+    """Values (H, W) with unknown ones filled by a mean around the nearest known, without edges."""
+    if not known.any():
+        return np.zeros_like(values)
+    weight = cv2.GaussianBlur(known.astype(np.float32), (0, 0), 3)
     blurred = cv2.GaussianBlur(np.where(known, values, 0).astype(np.float32), (0, 0), 3)
-    filled = blurred / np.maximum(cv2.GaussianBlur(weight, (0, 0), 3), 1e-6)
+    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    filled = blurred[tuple(nearest)] / weight[tuple(nearest)]
     return np.where(known, values, filled).astype(np.float32)
 
 

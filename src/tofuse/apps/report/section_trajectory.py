@@ -134,5 +134,5 @@ def optimisation(s: Subject) -> Values:
         "figures": figures,
         "text": text,
         "not_improved": any(p.before > 0 and not p.improved for p in d.parts),
-        "proposal": check and check.errors and calibration_check.proposal(check.errors, check.best),
+        "proposal": check and calibration_check.in_words(check.errors),
     }

@@ -189,8 +189,7 @@ def _suspicion(check: calibration_check.CalibrationCheck | None) -> dict[str, An
     return {
         "alarm": check.alarm,
         "camera": check.errors,
-        "sigma": check.sigmas,
-        "focal_sigma": check.focal_sigma,
+        "sigma": {name: check.sigma(name) for name in check.errors},
         "estimates": check.estimates,
         "focal_motion_m": 0.01 * check.motion["focal"][0] if check.motion else None,
         "support": check.support,

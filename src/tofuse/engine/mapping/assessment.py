@@ -211,11 +211,11 @@ class Assessment:
         cross_view: cross_view_agreement.CrossViewConsistency | None,
     ) -> pose_accuracy.Accuracy:
         """Add the uncertainty of the camera's parameters and of the surface."""
-        check, corrections = refinement.calibration_check, self._estimated_corrections
+        check = refinement.calibration_check
         rms_m = np.nan if cross_view is None else cross_view.rms_m()
         return replace(
             accuracy,
-            camera_sigmas={} if check is None else camera_uncertainty.sigmas(check, corrections),
+            camera_sigmas={} if check is None else camera_uncertainty.sigmas(check),
             surface_m=rms_m if np.isfinite(rms_m) else None,
         )
 

@@ -18,7 +18,7 @@ _UNKNOWN = float(np.sqrt(pose_accuracy.UNKNOWN_FRACTION))
 
 
 def _credence(check: calibration_check.CalibrationCheck) -> float:
-    """Return the fraction of an estimated error that counts."""
+    """Return the fraction of the estimated errors that counts."""
     return 1.0 if check.is_likely else _UNKNOWN
 
 
@@ -27,43 +27,32 @@ def pose_errors(
 ) -> tuple[float, float]:
     """Return the rms of the pose errors (m, rad) due to the calibration.
 
-    An error that the views don't determine may be that of usual cameras. Added are the uncertainty
-    of corrections that were estimated from the views, and the gap of a loop that a better
-    calibration would close.
+    Those by the estimated errors and by their uncertainty, which is that of usual cameras where the
+    views don't determine them. A correction that was estimated from the views hides what all
+    sections of their images share.
     """
     credence_of_change = 1.0 if check.change_confirmed else _UNKNOWN
     errors = [
         _credence(check) * np.array(check.moved),
+        np.array(check.spread),
         credence_of_change * np.array(check.changed),
     ]
-    errors += [_UNKNOWN * np.array(motion) for motion in check.undetermined.values()]
-    if check.alarm and check.gap is not None:
-        errors.append(np.array(check.gap.before))
+    if not check.estimates:
+        errors += [calibration_check.USUAL * np.array(motion) for motion in check.motion.values()]
     for part in corrections:
         for name, motion in check.motion.items():
-            errors.append(part.sigmas[name] * np.array(motion))
-            if part.errors[name]:  # as of usual cameras, by what all views have in common
-                errors.append(_UNKNOWN * calibration_check.TOLERANCES[name] * np.array(motion))
+            errors.append(calibration_check.HIDDEN * part.sigmas[name] * np.array(motion))
     m, rad = np.linalg.norm(errors, axis=0).tolist()
     return m, rad
 
 
-def sigmas(
-    check: calibration_check.CalibrationCheck, corrections: Sequence[CameraErrors]
-) -> dict[str, float]:
+def sigmas(check: calibration_check.CalibrationCheck) -> dict[str, float]:
     """Return the standard deviations of the focal length and of the range offset, by name.
 
-    That of the focal length is that of usual cameras, as far as the views don't know better; it
-    stands for an offset that they don't determine. An estimated error that was not corrected counts
-    as in `pose_errors`.
+    Those of their estimates. An estimated error that was not corrected counts as in `pose_errors`.
     """
     found = {}
     for name in ("focal", "offset"):
-        error, sigma = check.estimates.get(name, (0.0, np.inf))
-        shown = max((part.sigmas[name] for part in corrections), default=0.0)
-        if not corrections and check.determines(name):
-            shown = (_credence(check) if name in check.errors else _UNKNOWN) * abs(error)
-        known = float(1 / np.hypot(1 / calibration_check.TOLERANCES[name], 1 / sigma))
-        if name == "focal" or shown > 0:
-            found[name] = float(np.hypot(shown, known))
+        error, sigma = check.estimates.get(name, (0.0, calibration_check.USUAL))
+        found[name] = float(np.hypot(_credence(check) * error, sigma))
     return found

@@ -31,10 +31,6 @@ from tofuse.engine.sensor import ERROR_OPTIONS, CameraErrors
 
 # The first estimate uses poses that the error has distorted, the second one does not.
 _ROUNDS = 2
-# Errors with much the same effect: a second correction would share one error out between both, and
-# the standard deviation of each alone does not include that. So it stays an alarm.
-_TRADED = {"focal": "offset", "offset": "focal"}
-
 Reconstruct = Callable[[Config], Reconstruction]
 
 
@@ -85,9 +81,7 @@ def self_calibrated(
 
 def in_words(correction: CameraErrors) -> str:
     """Describe a correction: "a focal length 4.5 % smaller"."""
-    return " and ".join(
-        calibration_check.in_words({name: e for name, e in correction.errors.items() if e})
-    )
+    return calibration_check.in_words({name: e for name, e in correction.errors.items() if e})
 
 
 def _estimated_error(
@@ -95,18 +89,18 @@ def _estimated_error(
 ) -> tuple[calibration_check.CalibrationCheck, CameraErrors] | None:
     """Return the calibration error that fits the views best; None without an alarm.
 
-    After a correction, also the remainder of the same error, even if it is within the tolerance.
+    After a correction, also the remainder of the same error without confirmation by a loop.
     """
     check = _check_of(result)
     if check is None:
         return None
-    best = check.best
-    remaining = check.improves and best in check.unconfirmed and applied.errors[best]
-    if not (check.alarm or remaining) or applied.errors.get(_TRADED.get(best, "")):
+    again = any(applied.errors[name] for name in check.unconfirmed) and check.improves
+    if not (check.alarm or again):
         return None
-    error, sigma = ERROR_OPTIONS[best]
+    values = {ERROR_OPTIONS[name][0]: error for name, error in check.errors.items()}
+    sigmas = {ERROR_OPTIONS[name][1]: check.sigma(name) for name in check.errors}
     try:
-        return check, CameraErrors(**{error: check.errors[best], sigma: check.sigmas[best]})
+        return check, CameraErrors(**values, **sigmas)
     except ValueError:
         return None  # implausibly large
 
@@ -123,8 +117,8 @@ def _is_better(candidate: Reconstruction, current: Reconstruction) -> bool:
 def _is_stable(candidate: Reconstruction, check: calibration_check.CalibrationCheck) -> bool:
     """Whether the views do not significantly undo the correction that a check proposed."""
     check_after = _check_of(candidate)
-    remaining = 0.0 if check_after is None else check_after.large.get(check.best, 0.0)
-    return remaining * check.errors[check.best] >= 0
+    remaining = check_after.errors if check_after is not None and check_after.certain else {}
+    return all(error * check.errors.get(name, 0.0) >= 0 for name, error in remaining.items())
 
 
 def _check_of(result: Reconstruction) -> calibration_check.CalibrationCheck | None:

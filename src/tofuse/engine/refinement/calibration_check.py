@@ -2,14 +2,14 @@
 
 A wrong focal length or principal point, neglected lens distortion or a depth offset bends the
 trajectory, and no single registration reveals it. But where views overlap, and above all where a
-path closes a loop, their residuals can't all be small. So each error is estimated separately, with
-all poses free. An error that makes the views more consistent is a proposal. It is an alarm if it
-exceeds the calibration error of usual cameras, sections of the images agree on it, and the gap of a
-loop by pairwise alignments of neighbours does not grow with it, or, for focal length and offset,
-confirms it.
+path closes a loop, their residuals can't all be small. So all errors are estimated together, with
+all poses free: they resemble each other, and alone each would take the effect of the others, as an
+offset of several centimetres that of a focal length 0.3 % off. All are of the size that is usual,
+or one of them is not (Bayesian model comparison). An unusual error is a proposal. It is an alarm if
+the views agree better with it, and the gap of a loop by pairwise alignments of neighbours does not
+grow with it, or, for focal length and offset, confirms it.
 
-The focal length stands for other errors too: a constant offset of the depth has much the same
-effect. A camera whose range changes has no single calibration: see `range_change`.
+A camera whose range changes has no single calibration: see `range_change`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from tofuse.engine.refinement.camera_response import (
     SECTIONS,
     SIGNIFICANT,
     Linearised,
-    significance_of,
+    Posterior,
 )
 from tofuse.engine.refinement.joint_alignment import (
     AlignedViews,
@@ -38,12 +38,7 @@ from tofuse.engine.refinement.joint_alignment import (
     mean_support,
 )
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, loop_gap, thinned
-from tofuse.engine.refinement.range_change import (
-    LikelyChange,
-    RangeChange,
-    likely_change,
-    range_change,
-)
+from tofuse.engine.refinement.range_change import RangeChange, likely_change, range_change
 from tofuse.engine.refinement.split_half import rms_motion
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views import pair_equations
@@ -65,13 +60,21 @@ QUANTITIES = {
     "center_y": "principal point",
     "distortion": "distortion",
 }
+# Standard deviation of the errors of usual cameras, uniform up to the tolerance, which is the same
+# for all; and of one that is not usual.
+USUAL, _UNUSUAL = 0.01 / 3**0.5, 0.1
+# Logarithm of the factor by which views are likelier with an error: strong evidence (Jeffreys).
+_STRONG = float(np.log(10))
+# Standard deviations by which a certain error exceeds the tolerance; and of a usual one that may
+# improve the views: worth a full estimate from this fraction of the tolerance.
+_CERTAIN, _PROMISING, _MIN_FIRST_STEP = 3.0, 4.0, 0.2
+# Multipath or mixed pixels may shift all sections of the images as much as these differ: multiple
+# of the standard deviation of an estimate, which is their mean.
+HIDDEN = SECTIONS**0.5
+# Views determine an error if they reduce the variance of usual ones to this fraction.
+_DETERMINED = 2 / 3
 # Errors that the drift over a loop can reveal; that by the others resembles any drift.
 _REVEALED_BY_LOOP = ("focal", "offset")
-# Significance of an error in standard deviations that makes a full estimate worth its time, and
-# the fraction of the tolerance that one Newton step must reach.
-_LIKELY, _MIN_FIRST_STEP = 2.5, 0.2
-# Errors with a larger standard deviation, as a fraction of the tolerance, are not reported.
-_MAX_SIGMA = 0.8
 # Change of the views' support that the sampling of points alone explains.
 _SUPPORT_NOISE = 0.003
 # An error that only the drift over the loop reveals must exceed the tolerance by this factor, with
@@ -102,53 +105,42 @@ class CalibrationCheck:
     ----------
     alarm
         Whether the camera's calibration should be checked.
-    errors, sigmas
-        Separate estimates of each error, as in `Refinement.errors`, and their standard deviations
-        from the spread between views. They are proposals and change nothing. Only significant
-        ones; in case of an alarm, all that the views determine.
+    errors
+        The error that is not usual, by its name, as in `Refinement.errors`; empty if there is none.
+        It is a proposal and changes nothing.
     support
-        Mean support of the views without and with the error `best`, see `joint_alignment.Support`.
+        Mean support of the views without and with all errors as estimated in full, see
+        `joint_alignment.Support`; None if they were not, or it falls.
     gap
-        Closure error of the longest loop; None if there is none, or no error is significant.
-    best
-        Name of the largest error when all significant ones are estimated together, relative to
-        its tolerance; empty if no error is significant.
-    focal_sigma
-        Standard deviation of the focal length estimated from the views, as a fraction; None if
-        there are too few views.
+        Closure error of the longest loop; None if there is none, or the views don't support the
+        estimates.
     estimates
-        First estimate of each error alone, by one Newton step, and its standard deviation from the
-        spread between views, significant or not.
+        Joint estimate of all errors and their standard deviations by name: by one Newton step, or
+        in full if one is not usual. Empty if there are too few views.
     motion
         Rms motion (m, rad) of the poses, after alignment, that a unit of each error causes.
-    moved
-        Largest rms motion (m, rad) of the poses, after alignment, if one of the likely errors is
-        corrected, or by the first estimate of one that the views determine or that is significant.
+    moved, spread
+        Rms motion (m, rad) of the poses, after alignment, by the estimated errors, and rms errors
+        of the poses by the uncertainty of these.
     changed, change_confirmed
         Rms motion (m, rad) of the poses by a change of the range, if that is significant, and
         whether it can't be multipath, see `RangeChange`.
-    significance
-        Number of standard deviations that an estimate must exceed to be significant, see
-        `significance_of`.
     range_change
         Change of the range over the views, if there is one; then no error is estimated.
     contradicted
-        Whether verified odometry contradicts the error `best`.
+        Whether verified odometry contradicts the estimates.
     """
 
     alarm: bool = False
     errors: dict[str, float] = field(default_factory=dict)
-    sigmas: dict[str, float] = field(default_factory=dict)
     support: tuple[float, float] | None = None
     gap: Gap | None = None
-    best: str = ""
-    focal_sigma: float | None = None
     estimates: dict[str, tuple[float, float]] = field(default_factory=dict)
     motion: dict[str, tuple[float, float]] = field(default_factory=dict)
     moved: tuple[float, float] = (0.0, 0.0)
+    spread: tuple[float, float] = (0.0, 0.0)
     changed: tuple[float, float] = (0.0, 0.0)
     change_confirmed: bool = True
-    significance: float = SIGNIFICANT
     range_change: RangeChange | None = None
     contradicted: bool = False
 
@@ -163,246 +155,241 @@ class CalibrationCheck:
 
     def determines(self, name: str) -> bool:
         """Whether the views determine an error of the camera."""
-        return name in self.estimates and _determined(name, self.estimates[name][1])
+        return name in self.estimates and self.sigma(name) ** 2 < _DETERMINED * USUAL**2
+
+    def sigma(self, name: str) -> float:
+        """Return the standard deviation of an estimate; that of usual errors without one."""
+        return self.estimates[name][1] if name in self.estimates else float(USUAL)
+
+    @property
+    def certain(self) -> bool:
+        """Whether an error is beyond the tolerance for certain."""
+        return any(
+            abs(error) > TOLERANCES[name] + _CERTAIN * self.sigma(name)
+            for name, error in self.errors.items()
+        )
 
     @property
     def unconfirmed(self) -> dict[str, float]:
-        """Significant errors without an alarm that may be true.
-
-        Either one of them is large, and neither a loop nor odometry confirms or contradicts it, or
-        the views agree better with the smaller ones.
-        """
-        if self.alarm or self.contradicted or (self.gap is not None and self.gap.contradicts):
-            return {}
-        if not self.large and not self.improves:
-            return {}
-        return {n: e for n, e in self.errors.items() if abs(e) > self.limit(n)}
+        """A certain error without an alarm that may well be true."""
+        return self.errors if self.certain and self.is_likely and not self.alarm else {}
 
     @property
     def is_likely(self) -> bool:
-        """Whether the estimated errors may well be true."""
-        return bool(self.unconfirmed or (self.improves and self.large and not self.contradicted))
+        """Whether the estimates may well be true, and nothing contradicts them."""
+        contradicted = self.contradicted or (self.gap is not None and self.gap.contradicts)
+        return self.alarm or (self.is_supported and not contradicted)
+
+    @property
+    def is_supported(self) -> bool:
+        """Whether the views agree better with the estimates, or show an unusual error."""
+        return self.improves or bool(self.errors)
 
     @property
     def improves(self) -> bool:
-        """Whether the views agree better with the error `best`, not by chance."""
+        """Whether the views agree better with the estimated errors, not by chance."""
         return self.support is not None and self.support[1] - self.support[0] > _SUPPORT_NOISE
 
     @property
-    def large(self) -> dict[str, float]:
-        """Significant errors that exceed the calibration error of usual cameras."""
-        return {n: e for n, e in self.errors.items() if _large(n, e, self.limit(n))}
-
-    @property
     def confirmed_by_loop(self) -> bool:
-        """Whether the gap of a loop confirms the error `best`, or allows for it.
+        """Whether the gap of a loop confirms the error, or allows for it.
 
         Multipath looks like a smaller focal length or offset, with which views agree better: a loop
         must confirm that. The others hardly change it, as their drift resembles any other.
         """
         if self.gap is None:
             return False
-        return self.gap.confirms if self.best in _REVEALED_BY_LOOP else not self.gap.grows
-
-    def limit(self, name: str) -> float:
-        """Return the size of an error from which it is significant."""
-        return self.significance * self.sigmas.get(name, np.inf)
-
-    def with_errors(self, errors: Mapping[str, float], first: _FirstEstimates) -> CalibrationCheck:
-        """Return the check with these errors, and the deviations of their first estimates."""
-        names = [name for name in _INDEX if name in errors]
-        sigmas = {name: first.sigmas[name] for name in names}
-        return replace(self, errors={name: errors[name] for name in names}, sigmas=sigmas)
-
-
-def _determined(name: str, sigma: float) -> bool:
-    return sigma < _MAX_SIGMA * TOLERANCES[name]
-
-
-def _large(name: str, error: float, limit: float, factor: float = 1.0) -> bool:
-    """Whether an error exceeds its tolerance, and the limit of significance."""
-    return abs(error) > max(factor * TOLERANCES[name], limit)
+        revealed = any(name in _REVEALED_BY_LOOP for name in self.errors)
+        return self.gap.confirms if revealed else not self.gap.grows
 
 
 def check_calibration(aligned: RefinedViews) -> CalibrationCheck:
     """Estimate the errors of the camera from views that were refined without such errors."""
     if not len(aligned.refined.pairs):
         return CalibrationCheck()
-    first = _FirstEstimates.of(aligned)
-    without_error = _by_first_estimates(aligned, first)
-    if len(aligned.views) < _MIN_VIEWS or without_error.range_change is not None:
+    refined = aligned.refined
+    views, pairs, options = thinned(aligned.views, refined.pairs, aligned.options)
+    linearised = Linearised.of(views, refined.poses, pairs, options, aligned.priors)
+    first = _Estimate.of(linearised)
+    usual = replace(first, found=first.if_usual, unusual="")
+    without_error = _by_first_estimate(aligned, linearised, usual)
+    if len(views) < _MIN_VIEWS or without_error.range_change is not None:
         return without_error
-    likely = [name for name in first.determined if first.is_likely(name)]
-    if not likely:
-        return _check_by_loop(aligned, first, without_error)
-    return _check_likely(aligned, first, without_error, likely)
+    if not first.is_promising:
+        return _check_by_loop(aligned, without_error)
+    return _check_promising(aligned, _Estimator(aligned, linearised, first), without_error)
 
 
-def _by_first_estimates(aligned: RefinedViews, first: _FirstEstimates) -> CalibrationCheck:
-    """Return what is known of the camera before any error is estimated in full."""
-    significance = significance_of(len(aligned.views))
+@dataclass(frozen=True, eq=False)
+class _Estimate:
+    """Joint estimate of all errors, in the order of `_INDEX`, by linearised views.
+
+    Attributes
+    ----------
+    poses
+        (N, 4, 4) of the views.
+    found, if_usual
+        The errors, K in all: of the likelier model, and if all are usual.
+    follow
+        (K, N, 6) twists by which the poses follow, per unit of each error.
+    prior_weight
+        Factor of the priors of the errors in reweighted least squares.
+    unusual
+        Name of the error that is not usual, empty if all are.
+    """
+
+    poses: Float64
+    found: Posterior
+    if_usual: Posterior
+    follow: Float64
+    prior_weight: float
+    unusual: str
+
+    @classmethod
+    def of(cls, linearised: Linearised) -> _Estimate:
+        """Estimate all errors."""
+        shared = linearised.shared_errors(list(_INDEX.values()))
+        models = {name: shared.posterior(_sigmas(name)) for name in ("", *_INDEX)}
+        best = max(models, key=lambda name: models[name].evidence)
+        if models[best].evidence - models[""].evidence < _STRONG:
+            best = ""
+        weight = shared.dispersion / linearised.curvature
+        return cls(linearised.poses, models[best], models[""], shared.motion, weight, best)
+
+    @property
+    def by_name(self) -> dict[str, tuple[float, float]]:
+        """Errors and their standard deviations."""
+        sigmas = np.sqrt(np.diag(self.found.covariance)).tolist()
+        return dict(zip(_INDEX, zip(self.found.errors.tolist(), sigmas, strict=True), strict=True))
+
+    @property
+    def is_promising(self) -> bool:
+        """Whether an error is not usual, or significant."""
+        return self.unusual != "" or any(
+            abs(error) > max(_PROMISING * sigma, _MIN_FIRST_STEP * TOLERANCES[name])
+            for name, (error, sigma) in self.by_name.items()
+        )
+
+    @property
+    def motion(self) -> dict[str, tuple[float, float]]:
+        """See `CalibrationCheck.motion`."""
+        return {name: self._motion(np.eye(len(_INDEX))[k]) for k, name in enumerate(_INDEX)}
+
+    @property
+    def moved(self) -> Float64:
+        """The poses (N, 4, 4) as they follow the errors."""
+        return self._moved(self.found.errors)
+
+    def _moved(self, errors: Float64) -> Float64:
+        return np.asarray(self.poses @ se3.exp(np.tensordot(errors, self.follow, 1)), np.float64)
+
+    @property
+    def spread(self) -> tuple[float, float]:
+        """See `CalibrationCheck.spread`."""
+        variances, axes = np.linalg.eigh(self.found.covariance)
+        columns = axes.T * np.sqrt(np.maximum(variances, 0.0))[:, None]
+        m, rad = np.linalg.norm([self._motion(column) for column in columns], axis=0).tolist()
+        return m, rad
+
+    def _motion(self, errors: Float64) -> tuple[float, float]:
+        """Rms motion (m, rad) of the poses by errors (K,), to first order."""
+        size = max(float(np.linalg.norm(errors)), 1e-12)
+        m, rad = rms_motion(self.poses, self._moved(_DELTA / size * errors))
+        return m / _DELTA * size, rad / _DELTA * size
+
+
+def _by_first_estimate(
+    aligned: RefinedViews, linearised: Linearised, first: _Estimate
+) -> CalibrationCheck:
+    """Return what is known of a usual camera before its errors are estimated in full."""
     if len(aligned.views) < _MIN_VIEWS:
-        return CalibrationCheck(motion=first.motion, significance=significance)
+        return CalibrationCheck(motion=first.motion)
     check = CalibrationCheck(
-        focal_sigma=first.sigmas["focal"],
-        estimates={name: (first.errors[name], first.sigmas[name]) for name in _INDEX},
+        estimates=first.by_name,
         motion=first.motion,
-        moved=first.largest_motion(significance),
-        significance=significance,
+        moved=rms_motion(first.poses, first.moved),
+        spread=first.spread,
     )
-    if first.change is None:
+    change = likely_change(linearised)
+    if change is None:
         return check
-    changed = range_change(first.change, aligned)
+    changed = range_change(change, aligned)
     if changed is not None and changed.is_large:
         return replace(check, range_change=changed)
-    if not (changed or first.change).is_significant:
+    if not (changed or change).is_significant:
         return check
-    ratio = abs(changed.change / first.change.scale) if changed else 1.0
-    m, rad = first.change_motion
+    ratio = abs(changed.change / change.scale) if changed else 1.0
+    moved = first.poses @ se3.exp(_DELTA * change.follow)
+    m, rad = (abs(change.scale) * x / _DELTA for x in rms_motion(first.poses, moved))
     confirmed = changed is None or changed.confirmed
     return replace(check, changed=(ratio * m, ratio * rad), change_confirmed=confirmed)
 
 
-def _check_likely(
-    aligned: RefinedViews,
-    first: _FirstEstimates,
-    without_error: CalibrationCheck,
-    likely: Sequence[str],
+def _check_promising(
+    aligned: RefinedViews, estimator: _Estimator, without_error: CalibrationCheck
 ) -> CalibrationCheck:
-    """Estimate likely errors in full, and check whether views, loops and odometry confirm them."""
-    estimator = _Estimator(aligned, first)
-    # Errors are correlated: in a joint estimate, the true one remains.
-    subsets = [[name] for name in likely] + ([list(likely)] if len(likely) > 1 else [])
-    # In parallel, as solving for the poses is serial.
-    found = run_all([partial(estimator.estimate, names) for names in subsets])
-    estimates, joint = dict(zip(likely, found, strict=False)), found[-1]
-    best_name = max(likely, key=lambda name: abs(joint.errors[_INDEX[name]]) / TOLERANCES[name])
-    best = estimates[best_name]
-    # Estimated together, correlated errors may be large and opposite.
-    largest = max(rms_motion(aligned.refined.poses, e.poses) for e in estimates.values())
+    """Estimate the errors in full, and check whether views, loops and odometry confirm them."""
+    fit = estimator.estimate()
+    support = estimator.support_of(fit)
+    if support[1] < support[0]:  # the first estimate led astray
+        return _check_by_loop(aligned, without_error)
+    estimate = _Estimate.of(_linearised(fit, aligned.priors))
+    name, estimates = estimate.unusual, estimate.by_name
+    is_large = name != "" and abs(estimates[name][0]) > TOLERANCES[name]
     check = replace(
         without_error,
-        support=estimator.support_of(best),
-        best=best_name,
-        moved=max(largest, without_error.moved),
-    ).with_errors({name: float(e.errors[_INDEX[name]]) for name, e in estimates.items()}, first)
-    certain = abs(check.errors[best_name]) > check.limit(best_name)
-    improves = certain and check.improves
-    if check.large or improves:
-        doubted = estimator.is_contradicted(best)
-        contradicted = doubted and aligned.priors.verified
-        gap = loop_gap(aligned, best.poses, best.errors)
-        check = replace(check, gap=gap, contradicted=contradicted)
+        errors={name: estimates[name][0]} if is_large else {},
+        support=support,
+        estimates=estimates,
+        moved=rms_motion(aligned.refined.poses, fit.poses),
+        spread=estimate.spread,
+    )
+    if check.is_supported:
+        doubted = estimator.is_contradicted(fit)
+        gap = loop_gap(aligned, fit.poses, fit.errors)
+        check = replace(check, gap=gap, contradicted=doubted and aligned.priors.verified)
         if doubted:  # odometry of unknown errors only prevents an alarm
             return check
-    confirmed = best_name in check.large and improves and check.confirmed_by_loop
-    if confirmed and _in_all_sections(best, best_name, aligned.priors):  # alternative explanations
-        others = [name for name in first.determined if name not in check.errors]
-        more = {name: float(estimator.estimate([name]).errors[_INDEX[name]]) for name in others}
-        return replace(check.with_errors(check.errors | more, first), alarm=True)
-    of_loop = _check_by_loop(aligned, first, without_error)
+        if check.improves and check.certain and check.confirmed_by_loop:
+            return replace(check, alarm=True)
+    of_loop = _check_by_loop(aligned, without_error)
     return of_loop if of_loop.alarm else check
 
 
-@dataclass(frozen=True, eq=False)
-class _FirstEstimates:
-    """Estimates of each error alone by one Newton step, by name.
-
-    Attributes
-    ----------
-    errors, sigmas
-        Estimates and standard deviations.
-    follow
-        (N, 6) twists by which the poses follow, per unit of each error.
-    motion
-        As in `CalibrationCheck`.
-    change
-        Change of the range over the views, if likely.
-    change_motion
-        Rms motion (m, rad) of the poses that it causes.
-    """
-
-    errors: dict[str, float]
-    sigmas: dict[str, float]
-    follow: dict[str, Float64]
-    motion: dict[str, tuple[float, float]]
-    change: LikelyChange | None
-    change_motion: tuple[float, float]
-
-    @classmethod
-    def of(cls, aligned: RefinedViews) -> _FirstEstimates:
-        """Estimate all errors."""
-        views, poses, pairs = aligned.views, aligned.refined.poses, aligned.refined.pairs
-        linearised = Linearised.of(views, poses, pairs, aligned.options, aligned.priors)
-        sensitivity = linearised.response_to_errors()
-        change = likely_change(linearised, views, pairs) if len(views) >= _MIN_VIEWS else None
-        change_motion = 0.0, 0.0
-        if change is not None and change.is_significant:
-            change_motion = _motion(poses, change.scale * change.follow)
-        errors, sigmas = sensitivity.estimate(), sensitivity.sigma(pairs, len(views))
-        return cls(
-            {name: float(errors[k]) for name, k in _INDEX.items()},
-            {name: float(sigmas[k]) for name, k in _INDEX.items()},
-            {name: sensitivity.motion[k] for name, k in _INDEX.items()},
-            {name: _motion(poses, sensitivity.motion[k]) for name, k in _INDEX.items()},
-            change,
-            change_motion,
-        )
-
-    @property
-    def determined(self) -> list[str]:
-        """Errors that the views determine."""
-        return [name for name in _INDEX if _determined(name, self.sigmas[name])]
-
-    def is_likely(self, name: str) -> bool:
-        """Whether a full estimate may be significant."""
-        limit = max(_LIKELY * self.sigmas[name], _MIN_FIRST_STEP * TOLERANCES[name])
-        return abs(self.errors[name]) > limit
-
-    def largest_motion(self, significance: float) -> tuple[float, float]:
-        """Largest rms motion (m, rad) of the poses by an error that the views determine.
-
-        Or by one whose estimate exceeds a number of standard deviations, however large they are.
-        """
-        sizes = {name: abs(error) for name, error in self.errors.items()}
-        motions = [
-            (sizes[name] * m, sizes[name] * rad)
-            for name, (m, rad) in self.motion.items()
-            if name in self.determined or sizes[name] > significance * self.sigmas[name]
-        ]
-        return max(motions, default=(0.0, 0.0))
-
-
 class _Estimator:
-    """Estimates errors from refined views: the overlaps are fixed, the poses are free.
+    """Estimates all errors from refined views: the overlaps are fixed, the poses are free.
 
-    Of many pairs, a part is used. Estimates start from the first ones, unless these are so large
-    that the overlaps of the views may be wrong.
+    Estimates start from the first ones, unless these are so large that the overlaps of the views
+    may be wrong.
     """
 
-    def __init__(self, aligned: RefinedViews, first: _FirstEstimates) -> None:
-        refined, priors = aligned.refined, aligned.priors
-        views, pairs, thinned_options = thinned(aligned.views, refined.pairs, aligned.options)
+    def __init__(self, aligned: RefinedViews, linearised: Linearised, first: _Estimate) -> None:
+        refined, state = aligned.refined, linearised.state
+        self._views, self._first = state.views, first
+        self._options = replace(state.options, rounds=COARSE_TO_FINE[-1:])
+        self._align = partial(
+            align_views,
+            state.views,
+            priors=aligned.priors,
+            pairs=state.pairs,
+            scales=refined.scales,
+        )
+        self._witness = aligned.priors.witness
         # An estimate of camera errors does not model errors that patches share, so it can't be
         # compared with the refined poses.
-        self._views, self._first = views, first
-        self._options = replace(thinned_options, rounds=COARSE_TO_FINE[-1:])
-        self._align = partial(align_views, views, priors=priors, pairs=pairs, scales=refined.scales)
-        self._witness = priors.witness
         self._poses = self._align(refined.poses, replace(self._options, rounds=_REALIGNMENT)).poses
 
-    def estimate(self, names: Sequence[str]) -> AlignedViews:
-        """Estimate one error, or several together."""
+    def estimate(self) -> AlignedViews:
+        """Estimate the errors in full."""
         first, options, poses = self._first, self._options, self._poses
-        errors = np.zeros(kernels.ERRORS)
-        if any(abs(first.errors[name]) > _MAX_DIRECT * TOLERANCES[name] for name in names):
+        calibrate, errors = list(_INDEX.values()), np.zeros(kernels.ERRORS)
+        usual = np.full(kernels.ERRORS, np.inf)
+        usual[calibrate] = _sigmas(first.unusual) / np.sqrt(first.prior_weight)
+        if np.abs(first.found.errors).max() > _MAX_DIRECT * max(TOLERANCES.values()):
             options = replace(options, rounds=COARSE_TO_FINE)
-        elif len(names) == 1:
-            (name,) = names
-            errors[_INDEX[name]] = first.errors[name]
-            poses = poses @ se3.exp(first.errors[name] * first.follow[name])
-        calibrate = [_INDEX[name] for name in names]
-        return self._align(poses, options, calibrate=calibrate, errors=errors)
+        else:
+            errors[calibrate], poses = first.found.errors, first.moved
+        return self._align(poses, options, calibrate=calibrate, errors=errors, usual=usual)
 
     def is_contradicted(self, estimate: AlignedViews) -> bool:
         """Whether poses with the errors of an estimate differ more from odometry, if there is any.
@@ -429,17 +416,15 @@ class _Estimator:
         return mean_support(estimate, self._poses)
 
 
-def _in_all_sections(estimate: AlignedViews, name: str, priors: Priors) -> bool:
-    """Whether sections of the images agree on an estimated error of the camera.
+def _sigmas(unusual: str) -> Float64:
+    """Return the standard deviations (K,) of errors, one of which is not usual, if any."""
+    return np.array([_UNUSUAL if name == unusual else USUAL for name in _INDEX])
 
-    Multipath, mixed pixels and periodic errors of the range look like one in some of them.
-    """
-    state, k = estimate.state, _INDEX[name]
-    linearised = Linearised.of(
-        state.views, estimate.poses, estimate.pairs, state.options, priors, estimate.errors
-    )
-    sigma = linearised.response_of_sections().sigma_by_rows()[k]
-    return bool(abs(estimate.errors[k]) > significance_of(SECTIONS) * sigma)
+
+def _linearised(fit: AlignedViews, priors: Priors) -> Linearised:
+    """Linearise views at their poses and errors of the camera."""
+    state = fit.state
+    return Linearised.of(state.views, fit.poses, fit.pairs, state.options, priors, fit.errors)
 
 
 def combine_checks(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:
@@ -452,7 +437,7 @@ def combine_checks(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:
     changes = [(abs(s.range_change.change), k) for k, s in enumerate(checks) if s.range_change]
     if changes:
         return checks[max(changes)[1]]
-    alarms = sorted((s for s in checks if s.alarm), key=lambda s: s.errors.get(s.best, 0.0))
+    alarms = sorted((s for s in checks if s.alarm), key=lambda s: [*s.errors.items()])
     if 2 * len(alarms) > len(checks):
         return alarms[len(alarms) // 2]
     without_alarm = [s for s in checks if not s.alarm]
@@ -461,15 +446,7 @@ def combine_checks(checks: Sequence[CalibrationCheck]) -> CalibrationCheck:
     return without_alarm[0] if without_alarm else CalibrationCheck()
 
 
-def _motion(poses: Float64, twists: Float64) -> tuple[float, float]:
-    """Return the rms motion (m, rad) per unit, given small twists (N, 6) per unit."""
-    m, rad = rms_motion(poses, poses @ se3.exp(_DELTA * twists))
-    return m / _DELTA, rad / _DELTA
-
-
-def _check_by_loop(
-    aligned: RefinedViews, first: _FirstEstimates, without_error: CalibrationCheck
-) -> CalibrationCheck:
+def _check_by_loop(aligned: RefinedViews, without_error: CalibrationCheck) -> CalibrationCheck:
     """Estimate the errors of the camera from the drift over the longest loop alone.
 
     A large error leaves a gap that a refinement may close by matching wrong surfaces. Then its
@@ -481,8 +458,6 @@ def _check_by_loop(
     ----------
     aligned
         The views, refined without errors.
-    first
-        The first estimates.
     without_error
         The result if there is no error.
     """
@@ -493,60 +468,61 @@ def _check_by_loop(
     if not loop.gap(uncorrected, uncorrected).significant:
         return without_error
 
-    def explained(name: str) -> tuple[float, Gap, bool] | None:
-        step = _LOOP_FACTOR * TOLERANCES[name]
-        error, corrected = loop.closing_error(uncorrected, _INDEX[name], step)
+    def explained(name: str) -> tuple[float, float, Gap, bool] | None:
+        limit = _LOOP_FACTOR * TOLERANCES[name]
+        error, corrected = loop.closing_error(uncorrected, _INDEX[name], limit)
         gap = loop.gap(uncorrected, corrected)
         if not gap.closes:
             return None
         by_views = loop.estimate_by_views(corrected, _INDEX[name], error)
         confirmed = float(by_views.errors[_INDEX[name]])
-        limit = without_error.significance * first.sigmas[name]
-        large = all(_large(name, e, limit, _LOOP_FACTOR) for e in (error, confirmed))
-        large = large and _in_all_sections(by_views, name, Priors.none())
-        return (error, gap, large) if confirmed * error > _MIN_CONFIRMED * error**2 else None
+        if confirmed * error < _MIN_CONFIRMED * error**2:
+            return None
+        shared = _linearised(by_views, Priors.none()).shared_errors([_INDEX[name]])
+        sigma = float(np.sqrt(shared.posterior(np.array([_UNUSUAL])).covariance[0, 0]))
+        large = min(abs(error), abs(confirmed)) > max(limit, SIGNIFICANT * sigma)
+        return error, sigma, gap, large
 
-    names = [name for name in _REVEALED_BY_LOOP if name in first.determined]
+    names = [name for name in _REVEALED_BY_LOOP if without_error.determines(name)]
     found = run_all([partial(explained, name) for name in names])
     explanations = {name: of for name, of in zip(names, found, strict=True) if of is not None}
     if not explanations:
         return without_error
-    best = min(explanations, key=lambda name: explanations[name][1].remaining_m)
-    large = {name: error for name, (error, _, is_large) in explanations.items() if is_large}
-    if best not in large:
+    best = min(explanations, key=lambda name: explanations[name][2].remaining_m)
+    error, sigma, gap, is_large = explanations[best]
+    if not is_large:
         return without_error
+    m, rad = np.maximum(without_error.moved, gap.before).tolist()
     return replace(
         without_error,
         alarm=True,
-        errors=large,
-        sigmas={name: first.sigmas[name] for name in large},
-        gap=explanations[best][1],
-        best=best,
+        errors={best: error},
+        estimates={**without_error.estimates, best: (error, sigma)},
+        moved=(m, rad),
+        gap=gap,
     )
 
 
-def in_words(errors: Mapping[str, float]) -> list[str]:
-    """Describe the correction of each error of the camera, as in `CalibrationCheck`, in words."""
+def in_words(errors: Mapping[str, float]) -> str:
+    """Describe the correction of errors of the camera: "a focal length 4.5 % smaller"."""
     words = []
-    if "focal" in errors:
-        change = 1 / (1 + errors["focal"]) - 1
-        more = "larger" if change > 0 else "smaller"
-        words.append(f"a focal length {percent(abs(change))} {more}")
-    if "offset" in errors:
-        more = "longer" if errors["offset"] > 0 else "shorter"
-        words.append(f"ranges {abs(errors['offset']) * 1e3:.0f} mm {more}")
-    for name, (less, more) in {"center_x": ("left", "right"), "center_y": ("up", "down")}.items():
-        if name in errors:
+    for name, error in errors.items():
+        if name == "focal":
+            change = 1 / (1 + error) - 1
+            more = "larger" if change > 0 else "smaller"
+            words.append(f"a focal length {percent(abs(change))} {more}")
+        elif name == "offset":
+            more = "longer" if error > 0 else "shorter"
+            words.append(f"ranges {abs(error) * 1e3:.0f} mm {more}")
+        elif name == "distortion":
+            kind = "barrel" if error > 0 else "pincushion"
+            words.append(f"{percent(abs(error))} more {kind} distortion at 45 degrees")
+        else:
             # A larger ray coordinate of a pixel is a principal point further left or up.
-            where = less if errors[name] > 0 else more
-            words.append(
-                f"a principal point {percent(abs(errors[name]))} of the focal length further "
-                f"{where}"
-            )
-    if "distortion" in errors:
-        kind = "barrel" if errors["distortion"] > 0 else "pincushion"
-        words.append(f"{percent(abs(errors['distortion']))} more {kind} distortion at 45 degrees")
-    return words
+            where = {"center_x": ("left", "right"), "center_y": ("up", "down")}[name][error < 0]
+            size = percent(abs(error))
+            words.append(f"a principal point {size} of the focal length further {where}")
+    return " and ".join(words)
 
 
 def usual_error(name: str) -> str:
@@ -554,12 +530,3 @@ def usual_error(name: str) -> str:
     if name == "offset":
         return length(TOLERANCES[name])
     return percent(TOLERANCES[name]) + " of the focal length" * name.startswith("center")
-
-
-def proposal(errors: Mapping[str, float], best: str) -> str:
-    """Describe the corrections of `errors` as alternatives; of more than two, only `best`."""
-    alternatives = in_words(errors)
-    if len(alternatives) < 3 or best not in errors:
-        return " or ".join(alternatives)
-    (text,) = in_words({best: errors[best]})
-    return f"{text} (or other calibration errors with a similar effect)"

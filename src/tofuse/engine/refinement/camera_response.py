@@ -1,12 +1,14 @@
-"""Response of refined views to errors of the camera: shared by all, or with a profile over them.
+"""Errors of the camera that refined views show: shared by all, or with a profile over them.
 
-Sections of the images tell errors of the camera from others that look like them, such as multipath
-or mixed pixels: an error of the camera is the same in all sections, near and far.
+Shared errors are estimated together, as they resemble each other: alone, the focal length takes the
+effect of an offset of the range, and conversely. Sections of the images tell them from others that
+look like them, such as multipath or mixed pixels: an error of the camera is the same in all
+sections, near and far.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,23 +27,21 @@ from tofuse.engine.stored_views import pair_equation_kernels as kernels
 SECTIONS = 8
 # Significance of an error in standard deviations of a normal distribution.
 SIGNIFICANT = 4.0
-_SHARED = kernels.SOURCE_SCALE  # number of errors that all views share
 _ESTIMATE_ALL = np.zeros(kernels.ERRORS, np.int64)
 _MAX_CORRELATION = 0.97  # of errors of successive views
 
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Sensitivity of each pair to single errors of the camera, all poses being free to follow.
+    """Sensitivity of each pair to the scale of the depth, all poses being free to follow.
 
-    The K errors are those that all views share, in the order of `kernels`, or the scale of the
-    depth by K profiles over the views.
+    It changes over the views by one of K profiles.
 
     Attributes
     ----------
     gradient, information
-        (M, K) of each pair i < j, both directions together, or of each section: first and second
-        derivative of its robust cost (Tukey's biweight).
+        (M, K) of each pair i < j, both directions together: first and second derivative of its
+        robust cost (Tukey's biweight).
     motion
         (K, N, 6) twist by which each pose follows, per unit of the error.
     """
@@ -51,7 +51,7 @@ class Response:
     motion: Float64
 
     def estimate(self) -> Float64:
-        """(K,) estimate of each error alone, by one Newton step."""
+        """(K,) estimate of each scale alone, by one Newton step."""
         return np.asarray(
             -self.gradient.sum(0) / np.maximum(self.information.sum(0), 1e-12), np.float64
         )
@@ -70,11 +70,6 @@ class Response:
             Number of views.
         """
         return self._sigma((self._of_views(pairs, view_count) ** 2).sum(0), view_count)
-
-    def sigma_by_rows(self) -> Float64:
-        """(K,) standard deviations as of `sigma`, from the scatter between rows, as of sections."""
-        residual_gradient = self.gradient + self.information * self.estimate()
-        return self._sigma((residual_gradient**2).sum(0), len(self.gradient))
 
     def serial(self, pairs: Intp, view_count: int) -> tuple[Float64, Float64]:
         """Return standard deviations and effective numbers of views (K,) of profiles over time.
@@ -116,29 +111,65 @@ class Response:
         return np.asarray(information.sum(0) ** 2 / squares, np.float64)
 
 
-def _derivatives(
-    H: Float64, g: Float64, column: Float64, initial_motion: Float64, follow: Float64
-) -> tuple[Float64, Float64]:
-    """First and second derivatives (P,) of the costs of pairs by a combination of errors.
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """What views tell of K errors of the camera.
 
-    Parameters
+    Attributes
     ----------
-    H, g
-        As of `Linearised`.
-    column
-        (P, ERRORS) combination of the errors.
-    initial_motion, follow
-        (P, 6) motions of the relative poses: without the errors, and per unit of them.
+    errors, covariance
+        (K,) most likely errors, and (K, K).
+    evidence
+        Logarithm of the probability of the views, but for a constant.
     """
-    mixed = (H[:, :6, 6:] @ column[..., None])[..., 0]
-    slope = g[:, :6] + (H[:, :6, :6] @ initial_motion[..., None])[..., 0]
-    first = (g[:, 6:] * column).sum(1) + (mixed * initial_motion).sum(1) + (slope * follow).sum(1)
-    second = (
-        np.einsum("mi,mij,mj->m", column, H[:, 6:, 6:], column)
-        + 2 * (mixed * follow).sum(1)
-        + np.einsum("mi,mij,mj->m", follow, H[:, :6, :6], follow)
-    )
-    return first, second
+
+    errors: Float64
+    covariance: Float64
+    evidence: float
+
+
+@dataclass(frozen=True, eq=False)
+class SharedErrors:
+    """Equations of K errors of the camera that all views share, all poses being free to follow.
+
+    Attributes
+    ----------
+    initial
+        (K,) errors at which they are linearised.
+    gradient, information
+        (K,) and (K, K) derivatives of the robust cost (Tukey's biweight).
+    dispersion
+        Ratio of the scatter of the gradients to that by the noise of independent pixels. All that
+        the views tell is worth so much less (quasi-likelihood, McCullagh and Nelder 1989, section
+        4.5). Noise that neighbouring pixels share, and errors of single views, scatter between
+        views; multipath, mixed pixels and periodic errors between sections of the images.
+    motion
+        (K, N, 6) twist by which each pose follows, per unit of each error.
+    """
+
+    initial: Float64
+    gradient: Float64
+    information: Float64
+    dispersion: float
+    motion: Float64
+
+    def posterior(self, sigmas: Float64) -> Posterior:
+        """Return the posterior of the errors, given standard deviations (K,) before the views."""
+        prior = np.diag(1 / sigmas**2)
+        information, gradient = (x / self.dispersion for x in (self.information, self.gradient))
+        covariance = np.linalg.inv(information + prior)
+        step = -covariance @ (gradient + prior @ self.initial)
+        errors = self.initial + step
+        cost = step @ (0.5 * information @ step + gradient) + 0.5 * errors @ prior @ errors
+        volume = 0.5 * np.linalg.slogdet(covariance)[1] - np.log(sigmas).sum()
+        return Posterior(errors, np.asarray(covariance, np.float64), float(volume - cost))
+
+
+def _scatter(gradients: Float64) -> Float64:
+    """Return the covariance (K, K) of the sum of gradients (n, K), by how they differ."""
+    deviations = gradients - gradients.mean(0)
+    n = len(gradients)
+    return np.asarray(n / (n - 1) * deviations.T @ deviations, np.float64)
 
 
 def _sections(points: Float32) -> Intp:
@@ -239,54 +270,103 @@ class Linearised:
         curvature = tukey.consistency(projective.ROBUST)
         return cls(state, poses, errors, system, T_i_j, H, g, factor, curvature)
 
-    def response_to_errors(self) -> Response:
-        """Return the response to each error that all views share."""
-        return self._response(self._shared_errors())
-
-    def response_of_sections(self) -> Response:
-        """Return the same by sections of the images, if poses follow as by whole images."""
-        motion = self.response_to_errors().motion
-        step, follow = self._relative(self._initial_step()), list(map(self._relative, motion))
-        sections = [_sections(view.points) for view in self.state.views]
-        first, second = np.zeros((2, SECTIONS, len(follow)))
-        for row in range(SECTIONS):
-            part = self.state.with_points([np.flatnonzero(s == row) for s in sections])
-            part.evaluate(self.poses, self.errors, _ESTIMATE_ALL, self.state.options.rounds[-1])
-            equations = part.without_exposure(range(kernels.ERRORS))
-            for k, column in enumerate(self._shared_errors()):
-                of_pairs = _derivatives(*equations, column, step, follow[k])
-                first[row, k], second[row, k] = (x.sum() for x in of_pairs)
-        return Response(first, second * self.curvature, motion)
-
-    def _shared_errors(self) -> list[Float64]:
-        return [np.eye(kernels.ERRORS)[[k] * len(self.H)] for k in range(_SHARED)]
+    def shared_errors(self, errors: Sequence[int]) -> SharedErrors:
+        """Return the equations of errors, by their numbers in `kernels`."""
+        columns = np.tile(np.eye(kernels.ERRORS)[:, errors], (len(self.H), 1, 1))
+        motion, along = self._along(columns)
+        step = self._relative(self._initial_step())
+        first, second = self._derivatives(self.H, self.g, step, along)
+        gradient = first.sum(0)
+        information = second.sum(0) + 1e-9 * np.eye(len(gradient))
+        estimate = -np.linalg.solve(information, gradient)
+        of_views = _by_view(first + second @ estimate, self.state.pairs, len(self.poses))
+        of_sections = self._of_sections(along, estimate)
+        # A pair counts for both of its views. Noise is in both scatters, on the safe side.
+        dispersion = sum(
+            weight * float(np.trace(np.linalg.solve(information, _scatter(gradients))))
+            for weight, gradients in ((0.5, of_views), (1.0, of_sections))
+        ) / len(information)
+        initial = self.errors[list(errors)]
+        return SharedErrors(initial, gradient, information, max(dispersion, 1.0), motion)
 
     def response_to_scales(self, profiles: Float64) -> Response:
         """Return the response to the scale of the depth by profiles (K, N) over the views."""
-        columns = np.zeros((len(profiles), len(self.H), kernels.ERRORS))
-        of_target = profiles[:, self.state.target]
-        # The response to the scale of the target is the remainder of that to a common one.
-        columns[..., kernels.SOURCE_SCALE] = profiles[:, self.state.source] - of_target
-        columns[..., kernels.SCALE] = of_target
-        return self._response(columns)
+        motion, along = self._along(self._scales(profiles))
+        step = self._relative(self._initial_step())
+        first, second = self._derivatives(self.H, self.g, step, along)
+        return Response(first, np.diagonal(second, axis1=1, axis2=2), motion)
 
-    def _response(self, columns: Iterable[Float64]) -> Response:
-        """Return the response to combinations (P, ERRORS) of the errors of each directed pair."""
-        H, initial_motion = self.H, self._relative(self._initial_step())
-        prior_rows = np.zeros((len(self.T_i_j) - len(H), 6))
-        first, second, motion = [], [], []
-        for column in columns:
-            mixed = (H[:, :6, 6:] @ column[..., None])[..., 0]
-            gradient = self.system.gradient(np.concatenate([mixed, prior_rows]), self.T_i_j)
-            follow = self.factor.solve(gradient)
+    def _derivatives(
+        self, H: Float64, g: Float64, initial: Float64, along: Float64
+    ) -> tuple[Float64, Float64]:
+        """First (M, K) and second (M, K, K) derivatives of the costs of pairs by combined changes.
+
+        Parameters
+        ----------
+        H, g
+            (P, 6 + ERRORS, 6 + ERRORS) and (P, 6 + ERRORS) equations of the directed pairs.
+        initial
+            (P, 6) motions of the relative poses without the changes.
+        along
+            (P, 6 + ERRORS, K) changes of the relative poses and errors.
+        """
+        slope = g + (H[:, :, :6] @ initial[..., None])[..., 0]
+        along_t = np.swapaxes(along, 1, 2)
+        first, second = (along_t @ slope[..., None])[..., 0], along_t @ H @ along
+        # Both directions of a pair together.
+        half = len(first) // 2
+        return first[:half] + first[half:], self.curvature * (second[:half] + second[half:])
+
+    def _scales(self, profiles: Float64) -> Float64:
+        """Return errors (P, ERRORS, K) of the directed pairs: scales by profiles (K, N)."""
+        columns = np.zeros((len(self.H), kernels.ERRORS, len(profiles)))
+        of_target = profiles[:, self.state.target].T
+        # The response to the scale of the target is the remainder of that to a common one.
+        columns[:, kernels.SOURCE_SCALE] = profiles[:, self.state.source].T - of_target
+        columns[:, kernels.SCALE] = of_target
+        return columns
+
+    def section_sigma(self, profile: Float64) -> float:
+        """Standard deviation of the scale by a profile (1, N), from the scatter between sections.
+
+        An error that differs over the image is no change of the range, though with steady motion
+        views drift apart by it: what enters on one side leaves on the other.
+        """
+        _, along = self._along(self._scales(profile))
+        step = self._relative(self._initial_step())
+        first, second = (x.sum(0) for x in self._derivatives(self.H, self.g, step, along))
+        scatter = _scatter(self._of_sections(along, -first / second[0]))
+        return float(np.sqrt(scatter[0, 0]) / max(second[0, 0], 1e-12))
+
+    def _of_sections(self, along: Float64, estimate: Float64) -> Float64:
+        """Return the gradients (SECTIONS, K) of sections of the images at an estimate (K,)."""
+        step = self._relative(self._initial_step())
+        sections = [_sections(view.points) for view in self.state.views]
+        gradients = []
+        for section in range(SECTIONS):
+            part = self.state.with_points([np.flatnonzero(s == section) for s in sections])
+            part.evaluate(self.poses, self.errors, _ESTIMATE_ALL, self.state.options.rounds[-1])
+            equations = part.without_exposure(range(kernels.ERRORS))
+            first, second = self._derivatives(*equations, step, along)
+            gradients.append(first.sum(0) + second.sum(0) @ estimate)
+        return np.array(gradients)
+
+    def _along(self, columns: Float64) -> tuple[Float64, Float64]:
+        """Return how poses follow combinations (P, ERRORS, K) of the errors of directed pairs.
+
+        The twists (K, N, 6) of the poses, and the changes (P, 6 + ERRORS, K) of the relative poses
+        and errors of the pairs.
+        """
+        mixed = self.H[:, :6, 6:] @ columns
+        prior_rows = np.zeros((len(self.T_i_j) - len(mixed), 6))
+        motion = []
+        for k in range(columns.shape[2]):
+            of_pairs = np.concatenate([mixed[..., k], prior_rows])
+            follow = self.factor.solve(self.system.gradient(of_pairs, self.T_i_j))
             assert follow is not None, "the system is finite"
             motion.append(follow)
-            of_pairs = _derivatives(H, self.g, column, initial_motion, self._relative(follow))
-            first.append(of_pairs[0])
-            second.append(of_pairs[1])
-        # Both directions of a pair together.
-        by_pair = [np.array(x).reshape(len(x), 2, -1).sum(1).T for x in (first, second)]
-        return Response(by_pair[0], by_pair[1] * self.curvature, np.array(motion))
+        relative = np.stack([self._relative(follow) for follow in motion], 2)
+        return np.array(motion), np.concatenate([relative, columns], 1)
 
     def _initial_step(self) -> Float64:
         step = self.factor.step()

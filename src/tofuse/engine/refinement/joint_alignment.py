@@ -262,8 +262,7 @@ class AlignedViews:
     @property
     def pairs(self) -> Intp:
         """(M, 2) positions of the overlapping views i < j."""
-        count = len(self.state.target) // 2
-        return np.stack([self.state.target[:count], self.state.source[:count]], 1)
+        return self.state.pairs
 
 
 def align_views(
@@ -273,6 +272,7 @@ def align_views(
     *,
     calibrate: Sequence[int] = (),
     errors: Float64 | None = None,
+    usual: Float64 | None = None,
     priors: Priors | None = None,
     pairs: Intp | None = None,
     bodies: Bodies | None = None,
@@ -281,7 +281,8 @@ def align_views(
     """Do as `refine` does, without measuring the support and the pairs of the result.
 
     Gauss-Newton on all residuals, with correspondences recomputed in each iteration. The parameters
-    are those of `refine`, and scales of pairs to begin with.
+    are those of `refine`; initial errors of the camera, and the standard deviations (ERRORS,) that
+    are usual; and scales of pairs to begin with.
     """
     priors = priors or Priors.none()
     errors = np.zeros(kernels.ERRORS) if errors is None else errors
@@ -311,7 +312,8 @@ def align_views(
             state.evaluate(poses, errors, fixed_errors, stage, by_patch=by_patch)
             if by_patch:
                 state.discount_shared(poses)
-            step, error_step = _solve(poses, state, system, fixed_errors, priors, bodies)
+            known = errors, np.full(len(errors), np.inf) if usual is None else usual
+            step, error_step = _solve(poses, state, system, fixed_errors, known, priors, bodies)
             factor, earlier_error_step = _extrapolation(error_step, earlier_error_step)
             step, error_step = factor * step, factor * error_step
             poses = _apply_step(poses, step, bodies)
@@ -484,10 +486,14 @@ def _solve(
     state: pair_equations.DirectedPairs,
     system: sparse.PairSystem,
     fixed_errors: Int64,
+    known: tuple[Float64, Float64],
     priors: Priors,
     bodies: Bodies | None,
 ) -> tuple[Float64, Float64]:
-    """One Gauss-Newton step: (N, 6) right perturbations of views or bodies, and of the errors."""
+    """One Gauss-Newton step: (N, 6) right perturbations of views or bodies, and of the errors.
+
+    `known` are the current errors (ERRORS,), and the standard deviations of usual ones.
+    """
     estimated = np.flatnonzero(fixed_errors == 0)
     H, g = state.without_exposure(estimated.tolist())
     if bodies is not None:
@@ -507,8 +513,8 @@ def _solve(
             system.gradient(np.concatenate([H[:, :6, k], np.zeros((prior_count, 6))]), T_i_j)
             for k in range(6, H.shape[1])
         ],
-        H[:, 6:, 6:].sum(0),
-        g[:, 6:].sum(0),
+        H[:, 6:, 6:].sum(0) + np.diag(1 / known[1][estimated] ** 2),
+        g[:, 6:].sum(0) + known[0][estimated] / known[1][estimated] ** 2,
     )
     damping = projective.WEAK / _ERROR_UNIT**2 + DAMPING * shared.H.diagonal()
     if priors.gravity is not None:

@@ -9,17 +9,16 @@ views are scaled by it and aligned again.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
-from tofuse.engine.refinement.camera_response import Linearised, significance_of
+from tofuse.engine.refinement.camera_response import SECTIONS, Linearised, significance_of
 from tofuse.engine.refinement.joint_alignment import RefinedViews, align_views
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, thinned
-from tofuse.engine.stored_views import SampledView, pair_equations
+from tofuse.engine.stored_views import pair_equations
 
 # Makers specify range errors of up to a percent. Those that depend on the distance, or multipath,
 # look like smaller changes, as later views see other distances.
@@ -51,6 +50,9 @@ class RangeChange:
     confirmed
         Whether the change is significant, too, if the errors of successive views resemble each
         other. If not, it may be multipath, which differs from room to room.
+    in_all_sections
+        Whether sections of the images agree on it. If not, it is another error of the camera, by
+        which steady motion looks like a drift.
     """
 
     change: float
@@ -58,6 +60,7 @@ class RangeChange:
     frame: int | None
     limit: float
     confirmed: bool = True
+    in_all_sections: bool = True
 
     @property
     def is_significant(self) -> bool:
@@ -67,7 +70,8 @@ class RangeChange:
     @property
     def is_large(self) -> bool:
         """Whether it is confirmed, and beyond the tolerance of usual cameras."""
-        return self.is_significant and self.confirmed and abs(self.change) > TOLERANCE
+        certain = self.is_significant and self.confirmed and self.in_all_sections
+        return certain and abs(self.change) > TOLERANCE
 
     def in_words(self) -> str:
         """Describe the change."""
@@ -109,18 +113,12 @@ class LikelyChange:
         return abs(self.scale) > self.limit * self.sigma
 
 
-def likely_change(
-    linearised: Linearised, views: Sequence[SampledView], pairs: Intp
-) -> LikelyChange | None:
+def likely_change(linearised: Linearised) -> LikelyChange | None:
     """Return the best step or drift over the views; None if it is no more than noise.
 
-    Parameters
-    ----------
-    linearised, pairs
-        N views with pairs (M, 2), linearised at their refined poses.
-    views
-        The views.
+    The views are linearised at their refined poses.
     """
+    views, pairs = linearised.state.views, linearised.state.pairs
     count = len(views)
     index = np.array([view.index for view in views], float)
     drift = (index - index[0]) / max(float(np.ptp(index)), 1.0)
@@ -151,8 +149,8 @@ def range_change(likely: LikelyChange, aligned: RefinedViews) -> RangeChange | N
     views, pairs, options = thinned(aligned.views, refined.pairs, aligned.options)
     options = replace(options, rounds=_ROUNDS)
     poses = refined.poses @ se3.exp(likely.scale * likely.follow)
-    scale, sigma = likely.scale, likely.sigma
-    for _ in range(_MAX_STEPS):
+    scale, sigma, section_sigma = likely.scale, likely.sigma, np.inf
+    for left in reversed(range(_MAX_STEPS)):
         factors = 1 + scale * likely.profile
         scaled = [view.scaled(factor) for view, factor in zip(views, factors, strict=True)]
         poses = align_views(scaled, poses, options, priors=priors, pairs=pairs).poses
@@ -161,12 +159,15 @@ def range_change(likely: LikelyChange, aligned: RefinedViews) -> RangeChange | N
         found = linearised.response_to_scales(profile)
         step, sigma = float(found.estimate()[-1]), float(found.sigma(pairs, len(views))[-1])
         serial_sigma, independent = (float(v[-1]) for v in found.serial(pairs, len(views)))
+        is_last = not left or abs(step) < _CONVERGED * TOLERANCE
+        if is_last:
+            section_sigma = linearised.section_sigma(profile)
         scale += step
         poses = poses @ se3.exp(step * found.motion[-1])
         del scaled, linearised, found  # before the views are copied again
-        if abs(step) < _CONVERGED * TOLERANCE:
+        if is_last:
             break
     change = 1 / (1 + scale) - 1
-    serial_limit = significance_of(independent, tests=len(views))
-    confirmed = abs(change) > serial_limit * serial_sigma
-    return RangeChange(change, sigma, likely.frame, likely.limit, confirmed)
+    confirmed = abs(change) > significance_of(independent, tests=len(views)) * serial_sigma
+    in_all_sections = abs(change) > significance_of(SECTIONS) * section_sigma
+    return RangeChange(change, sigma, likely.frame, likely.limit, confirmed, in_all_sections)

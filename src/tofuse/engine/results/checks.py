@@ -590,12 +590,15 @@ def _calibration_alarm(e: Evidence) -> Iterator[Reason]:
         return
     gap = check.gap
     (m, rad), (m_after, rad_after) = gap.before, gap.after
-    correction = calibration_check.proposal(check.errors, check.best)
-    text = (
-        f"Odometry drift over loop {gap.i}-{gap.j} is {length(m)}, {_angle(rad)}. "
-        f"{correction[0].upper()}{correction[1:]} would reduce it to {length(m_after)}, "
-        f"{_angle(rad_after)}: check the calibration."
-    )
+    correction = calibration_check.in_words(check.errors)
+    if gap.confirms:
+        text = (
+            f"Odometry drift over loop {gap.i}-{gap.j} is {length(m)}, {_angle(rad)}. "
+            f"{correction[0].upper()}{correction[1:]} would reduce it to {length(m_after)}, "
+            f"{_angle(rad_after)}: check the calibration."
+        )
+    else:  # an error that the drift hardly shows
+        text = f"Views agree clearly better with {correction}: check the calibration."
     yield Reason("calibration_alarm", ((gap.i, gap.j),), text)
 
 
@@ -619,15 +622,10 @@ def _unchecked_calibration(e: Evidence) -> Iterator[Reason]:
                 text += ", but the recorded odometry, or the device's own poses, limit that"
             text += "."
     elif check.unconfirmed:
-        correction = calibration_check.proposal(check.unconfirmed, check.best)
-        qualifier = (
-            "but no loop closure confirms it"
-            if check.large
-            else "which is within the usual tolerance"
-        )
+        correction = calibration_check.in_words(check.unconfirmed)
         text = (
-            f"Views agree better with {correction}, {qualifier}: the stated accuracy includes its "
-            "effect."
+            f"Views agree better with {correction}, but no loop closure confirms it: the stated "
+            "accuracy includes its effect."
         )
     else:
         return

@@ -122,6 +122,12 @@ class DirectedPairs:
     rows: Float64 = field(default_factory=lambda: np.zeros((0, kernels.SIZE)))
     sums: Float64 = field(default_factory=lambda: np.zeros((0, 0, kernels.PATCH_SIZE)))
 
+    @property
+    def pairs(self) -> Intp:
+        """(M, 2) positions of the views i < j."""
+        count = len(self.target) // 2
+        return np.stack([self.target[:count], self.source[:count]], 1)
+
     @classmethod
     def of(
         cls,
