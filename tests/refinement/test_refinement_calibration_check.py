@@ -286,6 +286,8 @@ def test_certain_error_exceeds_the_tolerance_by_more_than_its_uncertainty() -> N
     assert certain.unconfirmed == {"offset": 0.05}
     assert possible.is_likely
     assert not possible.unconfirmed
+    # A lens of another model needs many errors at once.
+    assert not replace(certain, estimates=certain.estimates | {"center_x": (0.03, 0.01)}).certain
     usual = replace(possible, errors={})
     assert not usual.is_likely
     assert replace(usual, support=(0.8, 0.81)).is_likely

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
+from scipy.special import chdtri
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import run_all
@@ -68,6 +69,9 @@ _STRONG = float(np.log(10))
 # Standard deviations by which a certain error exceeds the tolerance; and of a usual one that may
 # improve the views: worth a full estimate from this fraction of the tolerance.
 _CERTAIN, _PROMISING, _MIN_FIRST_STEP = 3.0, 4.0, 0.2
+# Sum of the squares of four usual errors that chance exceeds once in a thousand, relative to their
+# variance.
+_MAX_OTHERS = float(chdtri(len(TOLERANCES) - 1, 0.001))
 # Multipath or mixed pixels may shift all sections of the images as much as these differ: multiple
 # of the standard deviation of an estimate, which is their mean.
 HIDDEN = SECTIONS**0.5
@@ -163,8 +167,12 @@ class CalibrationCheck:
 
     @property
     def certain(self) -> bool:
-        """Whether an error is beyond the tolerance for certain."""
-        return any(
+        """Whether one error is beyond the tolerance for certain, and it alone.
+
+        If others are not usual either, the views show something else, such as another lens model.
+        """
+        others = [e for name, (e, _) in self.estimates.items() if name not in self.errors]
+        return float(np.sum(np.square(others))) < _MAX_OTHERS * USUAL**2 and any(
             abs(error) > TOLERANCES[name] + _CERTAIN * self.sigma(name)
             for name, error in self.errors.items()
         )
