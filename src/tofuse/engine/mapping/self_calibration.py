@@ -4,9 +4,9 @@ Refined views show whether an error of the intrinsics or of the depth distorts t
 with a correction, they support each other better, and the drift over a loop is smaller
 (`refinement.calibration_check`). The recording is then reconstructed again with the correction,
 which is kept only if the error bound of the poses is smaller (`quality.pose_accuracy`), although it
-includes the uncertainty of the correction. If neither trajectory is bounded, views must fit better
-before refinement. And the correction must be stable: if a calibration error only happens to explain
-a drift, the corrected views yield an estimate that undoes much of the correction.
+includes the uncertainty of the correction. And the correction must be stable: if a calibration
+error only happens to explain a drift, the corrected views yield an estimate that undoes much of the
+correction.
 """
 
 from __future__ import annotations
@@ -106,12 +106,12 @@ def _estimated_error(
 
 
 def _is_better(candidate: Reconstruction, current: Reconstruction) -> bool:
-    """Whether the candidate loses no poses, and its error bound is smaller."""
-    if candidate.has_pose.sum() < current.has_pose.sum():
-        return False
-    new, old = _bound(candidate), _bound(current)
-    # If neither is bounded, the support of the views decides.
-    return new < old if np.isfinite([new, old]).any() else _support(candidate) > _support(current)
+    """Whether the candidate loses no poses, and its error bound is smaller.
+
+    Where nothing bounds the poses, surfaces may have slid, and an error of the camera explain that.
+    """
+    loses = candidate.has_pose.sum() < current.has_pose.sum()
+    return not loses and _bound(candidate) < _bound(current)
 
 
 def _is_stable(candidate: Reconstruction, check: calibration_check.CalibrationCheck) -> bool:
@@ -136,12 +136,6 @@ def _bound_change(before: float, after: float) -> str:
         return ""
     new, old = length(after), length(before)
     return f" The bound of the pose error is {new} (95 %) instead of {old}."
-
-
-def _support(result: Reconstruction) -> float:
-    """Return the support of the views before refinement, which may absorb the error."""
-    refinement = result.diagnostics.refinement
-    return refinement.support[0] if refinement is not None else 0.0
 
 
 def _with_calibration(
