@@ -17,6 +17,7 @@ import argparse
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -78,19 +79,12 @@ class Row:
 
 def rooms(seeds: Sequence[int], families: Sequence[str]) -> Iterator[tuple[str, Recording]]:
     """Yield names and recordings, with indirect light and without."""
-    for seed in seeds:
-        for family in families:
-            if family in other_sensor.SENSORS:
-                kinds = (True, False)[: 1 + other_sensor.SENSORS[family].has_indirect]
-                for scene in other_sensor.SCENES:
-                    for indirect in kinds:
-                        label = f"{scene}, {family}{'' if indirect else ', direct'}, seed {seed}"
-                        yield label, other_sensor.record(scene, family, seed, indirect=indirect)
-                continue
-            for camera in verdict.CAMERAS:
-                for indirect in (True, False):
-                    label = f"{family}, {camera}{'' if indirect else ', direct'}, seed {seed}"
-                    yield label, verdict.recorded(family, camera, seed, multipath=indirect)
+    sensors = [name for name in families if name in other_sensor.SENSORS]
+    scenes = [name for name in families if name in ROOMS]
+    for _, name, recording in chain(
+        verdict.other_recordings(seeds, sensors), verdict.simulated_recordings(seeds, scenes)
+    ):
+        yield name, recording
 
 
 def without_corrections(config: Config) -> Config:

@@ -193,31 +193,44 @@ def judged(
     )
 
 
-def simulated(seeds: Sequence[int], families: Sequence[str]) -> Iterator[Run]:
-    """Yield the runs of simulated recordings."""
+def simulated_recordings(
+    seeds: Sequence[int], scenes: Sequence[str]
+) -> Iterator[tuple[str, str, Recording]]:
+    """Yield scene, name and recording of all cameras, with multipath and without."""
     for seed in seeds:
-        for scene in families:
+        for scene in scenes:
             for camera in CAMERAS:
                 for multipath in (True, False):
-                    recording = recorded(scene, camera, seed, multipath=multipath)
                     label = "" if multipath else ", no multipath"
-                    for what, made in variants(recording):
-                        assert made.reference is not None
-                        name = f"{scene}, {camera}{label}, seed {seed}, {what}"
-                        yield judged(scene, name, made, [made.reference])
+                    name = f"{scene}, {camera}{label}, seed {seed}"
+                    yield scene, name, recorded(scene, camera, seed, multipath=multipath)
 
 
-def by_other_sensors(seeds: Sequence[int], sensors: Sequence[str]) -> Iterator[Run]:
-    """Yield the runs of recordings by the second simulator, with and without indirect light."""
+def simulated(seeds: Sequence[int], families: Sequence[str]) -> Iterator[Run]:
+    """Yield the runs of simulated recordings."""
+    for scene, name, recording in simulated_recordings(seeds, families):
+        for what, made in variants(recording):
+            assert made.reference is not None
+            yield judged(scene, f"{name}, {what}", made, [made.reference])
+
+
+def other_recordings(
+    seeds: Sequence[int], sensors: Sequence[str]
+) -> Iterator[tuple[str, str, Recording]]:
+    """Yield sensor, name and recording of the second simulator, with indirect light and without."""
     for seed in seeds:
         for sensor in sensors:
             for scene in other_sensor.SCENES:
                 for indirect in (True, False)[: 1 + other_sensor.SENSORS[sensor].has_indirect]:
-                    recording = other_sensor.record(scene, sensor, seed, indirect=indirect)
-                    assert recording.reference is not None
-                    label = "" if indirect else ", direct"
-                    name = f"{scene}, {sensor}{label}, seed {seed}"
-                    yield judged(f"other: {sensor}", name, recording, [recording.reference])
+                    name = f"{scene}, {sensor}{'' if indirect else ', direct'}, seed {seed}"
+                    yield sensor, name, other_sensor.record(scene, sensor, seed, indirect=indirect)
+
+
+def by_other_sensors(seeds: Sequence[int], sensors: Sequence[str]) -> Iterator[Run]:
+    """Yield the runs of recordings by the second simulator."""
+    for sensor, name, recording in other_recordings(seeds, sensors):
+        assert recording.reference is not None
+        yield judged(f"other: {sensor}", name, recording, [recording.reference])
 
 
 def real(data: Path) -> Iterator[Run]:

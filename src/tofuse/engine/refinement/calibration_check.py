@@ -163,7 +163,7 @@ class CalibrationCheck:
 
     def sigma(self, name: str) -> float:
         """Return the standard deviation of an estimate; that of usual errors without one."""
-        return self.estimates[name][1] if name in self.estimates else float(USUAL)
+        return self.estimates[name][1] if name in self.estimates else USUAL
 
     @property
     def certain(self) -> bool:

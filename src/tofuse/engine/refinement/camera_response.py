@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.special import ndtr, stdtrit  # scipy.stats takes long to import
@@ -274,8 +275,7 @@ class Linearised:
         """Return the equations of errors, by their numbers in `kernels`."""
         columns = np.tile(np.eye(kernels.ERRORS)[:, errors], (len(self.H), 1, 1))
         motion, along = self._along(columns)
-        step = self._relative(self._initial_step())
-        first, second = self._derivatives(self.H, self.g, step, along)
+        first, second = self._derivatives(self.H, self.g, along)
         gradient = first.sum(0)
         information = second.sum(0) + 1e-9 * np.eye(len(gradient))
         estimate = -np.linalg.solve(information, gradient)
@@ -292,25 +292,20 @@ class Linearised:
     def response_to_scales(self, profiles: Float64) -> Response:
         """Return the response to the scale of the depth by profiles (K, N) over the views."""
         motion, along = self._along(self._scales(profiles))
-        step = self._relative(self._initial_step())
-        first, second = self._derivatives(self.H, self.g, step, along)
+        first, second = self._derivatives(self.H, self.g, along)
         return Response(first, np.diagonal(second, axis1=1, axis2=2), motion)
 
-    def _derivatives(
-        self, H: Float64, g: Float64, initial: Float64, along: Float64
-    ) -> tuple[Float64, Float64]:
+    def _derivatives(self, H: Float64, g: Float64, along: Float64) -> tuple[Float64, Float64]:
         """First (M, K) and second (M, K, K) derivatives of the costs of pairs by combined changes.
 
         Parameters
         ----------
         H, g
             (P, 6 + ERRORS, 6 + ERRORS) and (P, 6 + ERRORS) equations of the directed pairs.
-        initial
-            (P, 6) motions of the relative poses without the changes.
         along
             (P, 6 + ERRORS, K) changes of the relative poses and errors.
         """
-        slope = g + (H[:, :, :6] @ initial[..., None])[..., 0]
+        slope = g + (H[:, :, :6] @ self._step[..., None])[..., 0]
         along_t = np.swapaxes(along, 1, 2)
         first, second = (along_t @ slope[..., None])[..., 0], along_t @ H @ along
         # Both directions of a pair together.
@@ -333,21 +328,19 @@ class Linearised:
         views drift apart by it: what enters on one side leaves on the other.
         """
         _, along = self._along(self._scales(profile))
-        step = self._relative(self._initial_step())
-        first, second = (x.sum(0) for x in self._derivatives(self.H, self.g, step, along))
+        first, second = (x.sum(0) for x in self._derivatives(self.H, self.g, along))
         scatter = _scatter(self._of_sections(along, -first / second[0]))
         return float(np.sqrt(scatter[0, 0]) / max(second[0, 0], 1e-12))
 
     def _of_sections(self, along: Float64, estimate: Float64) -> Float64:
         """Return the gradients (SECTIONS, K) of sections of the images at an estimate (K,)."""
-        step = self._relative(self._initial_step())
         sections = [_sections(view.points) for view in self.state.views]
         gradients = []
         for section in range(SECTIONS):
             part = self.state.with_points([np.flatnonzero(s == section) for s in sections])
             part.evaluate(self.poses, self.errors, _ESTIMATE_ALL, self.state.options.rounds[-1])
             equations = part.without_exposure(range(kernels.ERRORS))
-            first, second = self._derivatives(*equations, step, along)
+            first, second = self._derivatives(*equations, along)
             gradients.append(first.sum(0) + second.sum(0) @ estimate)
         return np.array(gradients)
 
@@ -368,10 +361,12 @@ class Linearised:
         relative = np.stack([self._relative(follow) for follow in motion], 2)
         return np.array(motion), np.concatenate([relative, columns], 1)
 
-    def _initial_step(self) -> Float64:
+    @cached_property
+    def _step(self) -> Float64:
+        """Motion (P, 6) of the relative poses to their optimum without changes of the errors."""
         step = self.factor.step()
         assert step is not None, "the system is finite"
-        return step
+        return self._relative(step)
 
     def _relative(self, step: Float64) -> Float64:
         """Return the motion (P, 6) of the relative poses by a step (N, 6)."""

@@ -286,6 +286,7 @@ def align_views(
     """
     priors = priors or Priors.none()
     errors = np.zeros(kernels.ERRORS) if errors is None else errors
+    usual = np.full(kernels.ERRORS, np.inf) if usual is None else usual
     fixed_errors = np.ones(kernels.ERRORS, np.int64)
     fixed_errors[list(calibrate)] = 0
     motions: list[float] = []
@@ -312,7 +313,7 @@ def align_views(
             state.evaluate(poses, errors, fixed_errors, stage, by_patch=by_patch)
             if by_patch:
                 state.discount_shared(poses)
-            known = errors, np.full(len(errors), np.inf) if usual is None else usual
+            known = errors, usual
             step, error_step = _solve(poses, state, system, fixed_errors, known, priors, bodies)
             factor, earlier_error_step = _extrapolation(error_step, earlier_error_step)
             step, error_step = factor * step, factor * error_step
