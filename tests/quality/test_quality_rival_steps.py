@@ -93,6 +93,23 @@ def test_floor_of_tiles_is_ambiguous_where_a_step_by_a_tile_is_possible() -> Non
     assert above(tiles, 0.1) == ()  # 3 m/s would be necessary
 
 
+def along(height, seconds: float, step: float = 0.16, count: int = 8) -> tuple[int, ...]:
+    """The same for a camera that moves by more than half a period at a time."""
+    steps = (step, 0.0, 0.0)
+    frames = [floor_from_above(height, k, step=steps) for k in range(count)]
+    return found(frames, [se3.translation(k * np.array(steps)) for k in range(count)], seconds)
+
+
+def test_fast_camera_may_have_moved_the_other_way_if_nothing_contradicts() -> None:
+    def marked(x, y):  # in view of some frames
+        return tiles(x, y) + 0.1 * np.exp(-((x - 1.8) ** 2 + y**2) / 0.2)
+
+    assert along(tiles, 0.1) == (1, 3, 5, 7)  # by 0.14 m
+    assert along(marked, 0.1) == ()  # as it would have to turn round where the mark is seen
+    assert along(relief, 0.1) == ()
+    assert along(tiles, 0.03) == ()  # at 4.7 m/s
+
+
 @pytest.mark.parametrize("height", [tiles, blocks])
 def test_camera_that_seems_to_stand_still_may_have_moved_by_a_period(height) -> None:
     mapper = Mapper(from_method("default"), threads=1)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,13 +20,16 @@ from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
 from tofuse.engine.search import DISTINCT_M, pair_agreement
 from tofuse.engine.stored_views import PosedView
-from tofuse.engine.tracking import FrameTime, reach_m
+from tofuse.engine.tracking import HANDHELD, FrameTime, reach_m
 from tofuse.engine.views import PreparedView
 
 # Number of pairs of views that are examined, spread over those far enough apart in time.
 _MAX_PAIRS = 4
-# Starts: directions in the image plane, and distances as fractions of the reach.
-_DIRECTIONS = np.exp(0.25j * np.pi * np.arange(8))
+# Starts: directions in the image plane and along the axis, and distances as fractions of the reach.
+_ANGLES = np.arange(8) * np.pi / 4
+_DIRECTIONS = np.array(
+    [*np.stack([np.cos(_ANGLES), np.sin(_ANGLES), 0 * _ANGLES], axis=1), (0, 0, -1), (0, 0, 1)]
+)
 _DISTANCES = (0.3, 0.6, 0.9)
 _COARSE = projective.ProjectiveOptions(
     levels=(projective.Level(4, 12, 0.03, 0.1),), common_tilt=0.0, common_slope=0.0
@@ -43,6 +47,23 @@ _MAX_FINE = 4
 _MIN_OVERLAP, _MAX_LOSS, _EQUAL = 0.5, 0.25, 0.1
 
 
+class _Moved(NamedTuple):
+    """The step to a late frame, and what other step its time allows.
+
+    Attributes
+    ----------
+    step
+        (3,) m, as tracked, in the axes of the world.
+    deviation, reach
+        How far the true step may lie from it where the steps before are right; and its greatest
+        length, m.
+    """
+
+    step: Float64
+    deviation: float
+    reach: float
+
+
 def ambiguous_frames(
     views: Sequence[PosedView[PreparedView]], poses: Mapping[int, Float64],
     moments: Sequence[FrameTime],
@@ -50,41 +71,54 @@ def ambiguous_frames(
     """Return the frames to which another step, from the view before, fits as well.
 
     Some pairs of consecutive views are examined: of those where a frame came so late after the one
-    before that the camera may have moved otherwise.
+    before that the camera may have moved otherwise. A step that differs more from the tracked one
+    than a camera accelerates is possible only if all steps differ.
 
     Parameters
     ----------
     views
         Stored views.
     poses
-        (4, 4) T_world_camera of each, by frame index.
+        (4, 4) T_world_camera of each, and of all frames in `moments`, by frame index.
     moments
         When the frames with a pose were taken, in order. Without timestamps nothing is examined.
     """
-    late = [
-        (now.index, reach)
+    late = {
+        now.index: moved
         for before, now in pairwise(moments)
         if (seconds := now.seconds_since(before)) is not None
-        and (reach := reach_m(seconds)) > DISTINCT_M
-    ]
+        and (moved := _moved(poses[before.index], poses[now.index], seconds)).reach > DISTINCT_M
+    }
     pairs = []
     for earlier, later in pairwise(sorted(views, key=lambda view: view.index)):
-        reaches = [reach for index, reach in late if earlier.index < index <= later.index]
-        if reaches and earlier.component == later.component:
-            pairs.append((earlier, later, max(reaches)))
+        moves = [late[index] for index in late if earlier.index < index <= later.index]
+        if moves and earlier.component == later.component:
+            pairs.append((earlier, later, max(moves, key=lambda moved: moved.reach)))
     chosen = np.unique(np.linspace(0, len(pairs) - 1, _MAX_PAIRS).astype(int)) if pairs else ()
-    found = []
-    for earlier, later, reach in (pairs[k] for k in chosen):
-        T = se3.inverse(poses[earlier.index]) @ poses[later.index]
-        if has_rival(earlier.view, later.view, T, reach):
-            found.append(later.index)
-    return tuple(found)
+    shifts = {}
+    for earlier, later, moved in (pairs[k] for k in chosen):
+        T_world_earlier = poses[earlier.index]
+        T = se3.inverse(T_world_earlier) @ poses[later.index]
+        moved = moved._replace(step=T_world_earlier[:3, :3].T @ moved.step)
+        shifts[later.index] = nearest_rival(earlier.view, later.view, T, moved), moved.deviation
+    everywhere = all(np.isfinite(shift) for shift, _ in shifts.values())
+    return tuple(k for k, (shift, deviation) in shifts.items() if everywhere or shift < deviation)
 
 
-def has_rival(
-    earlier: PreparedView, later: PreparedView, T_earlier_later: Float64, reach: float
-) -> bool:
-    """Whether a pose within the reach, m, is determined in all directions and fits as well."""
+def _moved(T_world_before: Float64, T_world_now: Float64, seconds: float) -> _Moved:
+    step, deviation = T_world_now[:3, 3] - T_world_before[:3, 3], reach_m(seconds)
+    length = float(np.linalg.norm(step))
+    # A camera that is faster than a person walks may be as fast in another direction.
+    return _Moved(step, deviation, deviation if length < deviation else HANDHELD[0] * seconds)
+
+
+def nearest_rival(
+    earlier: PreparedView, later: PreparedView, T_earlier_later: Float64, moved: _Moved
+) -> float:
+    """Return the distance of the nearest other pose that fits as well, m; inf without one.
+
+    It is within the reach, and determined in all directions. The step is in the earlier view's axes.
+    """
     targets = [projective.Target(earlier)]
 
     def aligned(
@@ -92,27 +126,42 @@ def has_rival(
     ) -> list[projective.Aligned]:
         return run_all([partial(projective.align, later, targets, T, options) for T in starts])
 
+    def shift(found: projective.Aligned) -> Float64:
+        return np.asarray(found.T_world_source[:3, 3] - own.T_world_source[:3, 3], np.float64)
+
     def is_rival(found: projective.Aligned) -> bool:
-        shift = found.T_world_source[:3, 3] - own.T_world_source[:3, 3]
-        return bool(DISTINCT_M < np.linalg.norm(shift) < reach)
+        return bool(
+            np.linalg.norm(shift(found)) > DISTINCT_M
+            and np.linalg.norm(moved.step + shift(found)) < moved.reach
+        )
 
     (own,) = aligned([T_earlier_later], _FINE)
-    offsets = reach * np.outer(_DISTANCES, _DIRECTIONS).ravel()
-    starts = [T_earlier_later @ se3.translation((d.real, d.imag, 0.0)) for d in offsets]
+    offsets = [r * axis for r in _DISTANCES for axis in _DIRECTIONS]
+    shifts = [moved.deviation * offset for offset in offsets]
+    if np.linalg.norm(moved.step) > 0.5 * moved.deviation:  # else about the same
+        shifts += [moved.reach * offset - moved.step for offset in offsets]
+    starts = [se3.translation(d) @ T_earlier_later for d in shifts]
     best = sorted(filter(is_rival, aligned(starts, _COARSE)), key=_score, reverse=True)[:_MAX_FINE]
     rivals = [
-        rival.T_world_source
+        rival
         for rival in aligned([b.T_world_source for b in best], _FINE)
         if is_rival(rival)
         and not len(rival.unobservable)
         and _score(rival) > (1 - _MAX_LOSS) * _score(own)
     ]
     if not rivals or own.overlap < _MIN_OVERLAP:
-        return False
+        return np.inf
     images = pair_agreement.Comparison.of(later, earlier)
     agreement = _agreement(images.at(own.T_world_source))
     least = agreement - _EQUAL * abs(agreement)  # it is negative where noise hides the pattern
-    return any(_agreement(images.at(T)) > least for T in rivals)
+    return min(
+        (
+            float(np.linalg.norm(shift(rival)))
+            for rival in rivals
+            if _agreement(images.at(rival.T_world_source)) > least
+        ),
+        default=np.inf,
+    )
 
 
 def _score(found: projective.Aligned) -> float:
