@@ -117,7 +117,8 @@ def nearest_rival(
 ) -> float:
     """Return the distance of the nearest other pose that fits as well, m; inf without one.
 
-    It is within the reach, and determined in all directions. The step is in the earlier view's axes.
+    It is within the reach, and determined in all directions. The step is in the axes of the
+    earlier view.
     """
     targets = [projective.Target(earlier)]
 
