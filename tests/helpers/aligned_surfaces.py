@@ -24,13 +24,14 @@ def path(count: int) -> np.ndarray:
     return se3.exp(twists)
 
 
-def surfaces(poses, noise=0.0, **kwargs):
+def surfaces(poses, noise=0.0, *, bias=0.0, **kwargs):
+    """Views with noise, and a bias (H, W) fixed to the camera, in m."""
     rng = np.random.default_rng(3)
     out = []
     for k, T in enumerate(poses):
         frame = replace(corner(T, **kwargs), index=k)
-        depth = frame.depth + noise * rng.standard_normal(frame.depth.shape).astype(np.float32)
-        out.append(prepare_view(replace(frame, depth=depth), SHARP))
+        depth = frame.depth + bias + noise * rng.standard_normal(frame.depth.shape)
+        out.append(prepare_view(replace(frame, depth=depth.astype(np.float32)), SHARP))
     return out
 
 

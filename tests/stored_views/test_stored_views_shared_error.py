@@ -19,6 +19,7 @@ from tofuse.engine.stored_views.pair_equations import RefineOptions
 from tofuse.engine.stored_views.view_store import SampledView
 from tofuse.engine.views.prepared_view import prepare_view
 
+CUTOFF = 3.5
 WIDE = (1.0, 50.0, 0.5)  # scale, robust limit (so wide that robust weights are 1), cosine
 
 
@@ -93,7 +94,8 @@ def test_sums_of_patches_match_normal_equations(pair):
 
 def discount(sums, correlation, variance, row):
     which = np.array([0])
-    marginalise_shared_errors(sums[None], correlation, np.array([variance]), which, row[None])
+    variances = np.array([variance])
+    marginalise_shared_errors(sums[None], correlation, variances, which, CUTOFF, row[None])
 
 
 def test_kernel_eliminates_one_unknown_per_patch(pair):
@@ -111,8 +113,12 @@ def test_kernel_eliminates_one_unknown_per_patch(pair):
     found_H, found_g = unpack(allowed)
     np.testing.assert_allclose(found_H, H, atol=1e-7 * np.abs(H).max())
     np.testing.assert_allclose(found_g, g, atol=1e-7 * np.abs(g).max())
+    # What the errors explain is no loss of support: the slope of (1 - r^2 / c^2)^3 by r^2.
+    explained = 3 / CUTOFF**2 * (h @ np.linalg.solve(big, h))
+    assert allowed[kernels.SUPPORT] - row[kernels.SUPPORT] == pytest.approx(explained, rel=1e-7)
     # Counts are unchanged, and without errors everything is.
-    np.testing.assert_array_equal(allowed[kernels.COMPARED :], row[kernels.COMPARED :])
+    counts = np.setdiff1d(np.arange(kernels.COMPARED, kernels.SIZE), kernels.SUPPORT)
+    np.testing.assert_array_equal(allowed[counts], row[counts])
     same = row.copy()
     discount(sums, correlation, 0.0, same)
     np.testing.assert_allclose(same, row, rtol=1e-9, atol=1e-9 * np.abs(row).max())

@@ -300,19 +300,18 @@ class Assessment:
     ) -> pose_accuracy.ObservedErrors:
         """Return the errors of the poses that their covariances don't include."""
         refinement, corrections = refined.refinement, self._estimated_corrections
-        shift = refinement.disputed_m, refinement.disputed_rad
+        moved = 0.0, 0.0
         if self._is_tracked:  # the initial error of given poses is unrelated to the final one
             moved = trajectory_errors.displacement(
                 closed.optimisation.graph.poses, refined.graph.poses
             )
-            shift = max(shift[0], moved[0]), max(shift[1], moved[1])
         excess_m = 0.0 if cross_view is None else cross_view.excess_m()
         calibration = 0.0, 0.0
         if refinement.calibration_check is not None:
             calibration = camera_uncertainty.pose_errors(refinement.calibration_check, corrections)
         split = refinement.split_m, refinement.split_rad
         return pose_accuracy.ObservedErrors(
-            *shift, excess_m, *calibration, *split, corrected=bool(corrections)
+            *moved, excess_m, *calibration, *split, corrected=bool(corrections)
         )
 
     def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:

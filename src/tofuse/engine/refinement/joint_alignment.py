@@ -127,12 +127,16 @@ class Refined:
     moved
         Largest motion of each iteration, in units of 1 cm and 1 degree.
     before, after
-        Support at the initial and at the refined poses, with the same sigmas.
+        Support at the initial and at the refined poses, with the same sigmas. Initial poses follow
+        errors of the camera, and so fit better than true ones; what errors explain that patches
+        share is no loss of the refined ones.
     measured, information
         (M, 4, 4) T_i_j that minimises the residuals of each pair alone, and (M, 6, 6) information
         of its right perturbation, from the noise of the views and the errors that patches share.
     scales
         Exposures and scales of the pairs in both directions.
+    shared
+        Variances of errors that patches share, for `support_of`, if they are modelled.
     """
 
     poses: Float64
@@ -145,6 +149,7 @@ class Refined:
     measured: Float64
     information: Float64
     scales: pair_equations.KnownScales
+    shared: Float64 | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,14 +232,15 @@ def refine(
     poses, errors, state = aligned.poses, aligned.errors, aligned.state
     fixed_errors = aligned.fixed_errors
     pairs = aligned.pairs
-    by_patch = not calibrate and state.depends_on_patches
-    after = _support(state, poses, errors, fixed_errors, by_patch=by_patch)
-    if by_patch:
-        state.discount_shared(poses)
+    by_patch, last = not calibrate and state.depends_on_patches, options.rounds[-1]
+    state.evaluate(poses, errors, fixed_errors, last, by_patch=by_patch)
+    shared = state.shared_variance(poses) if by_patch else None
+    after = _support(state, shared)
     measured = _pairwise_measurements(poses, pairs, state)
-    before = _support(state, start, np.zeros_like(errors), fixed_errors)
+    state.evaluate(start, np.zeros_like(errors), fixed_errors, last)
+    before = _support(state)
     moved, scales = aligned.moved, state.known_scales
-    return Refined(poses, start, errors, pairs, moved, before, after, *measured, scales)
+    return Refined(poses, start, errors, pairs, moved, before, after, *measured, scales, shared)
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,7 +318,7 @@ def align_views(
             by_patch = is_last and state.depends_on_patches
             state.evaluate(poses, errors, fixed_errors, stage, by_patch=by_patch)
             if by_patch:
-                state.discount_shared(poses)
+                state.discount_shared(state.shared_variance(poses))
             known = errors, usual
             step, error_step = _solve(poses, state, system, fixed_errors, known, priors, bodies)
             factor, earlier_error_step = _extrapolation(error_step, earlier_error_step)
@@ -350,7 +356,9 @@ def support_of(
     """Support of the same pairs at other poses (N, 4, 4), with the same sigmas."""
     scales = refined.scales.of(refined.pairs)
     state = pair_equations.DirectedPairs.of(views, refined.pairs, options, scales)
-    return _support(state, poses, refined.errors, (refined.errors == 0).astype(np.int64))
+    fixed_errors, by_patch = (refined.errors == 0).astype(np.int64), refined.shared is not None
+    state.evaluate(poses, refined.errors, fixed_errors, options.rounds[-1], by_patch=by_patch)
+    return _support(state, refined.shared)
 
 
 def mean_support(aligned: AlignedViews, start: Float64) -> tuple[float, float]:
@@ -358,10 +366,13 @@ def mean_support(aligned: AlignedViews, start: Float64) -> tuple[float, float]:
 
     Both with the sigmas of the aligned views.
     """
-    candidates = (start, np.zeros_like(aligned.errors)), (aligned.poses, aligned.errors)
-    before, after = (_support(aligned.state, *of, aligned.fixed_errors) for of in candidates)
-    count = len(start)
-    return float(before.of_views(count).mean()), float(after.of_views(count).mean())
+    state, last = aligned.state, aligned.state.options.rounds[-1]
+
+    def at(poses: Float64, errors: Float64) -> float:
+        state.evaluate(poses, errors, aligned.fixed_errors, last)
+        return float(_support(state).of_views(len(poses)).mean())
+
+    return at(start, np.zeros_like(aligned.errors)), at(aligned.poses, aligned.errors)
 
 
 def align_pairs(
@@ -442,15 +453,10 @@ def _apply_step(poses: Float64, step: Float64, bodies: Bodies | None) -> Float64
     return updated if bodies is None else bodies.view_poses(updated)
 
 
-def _support(
-    state: pair_equations.DirectedPairs,
-    poses: Float64,
-    errors: Float64,
-    fixed_errors: Int64,
-    *,
-    by_patch: bool = False,
-) -> Support:
-    state.evaluate(poses, errors, fixed_errors, state.options.rounds[-1], by_patch=by_patch)
+def _support(state: pair_equations.DirectedPairs, shared: Float64 | None = None) -> Support:
+    """Return the support by the last evaluation, less shared errors of variances (P,)."""
+    if shared is not None:
+        state.discount_shared(shared)
     score = state.rows[:, kernels.SUPPORT] - 2 * state.rows[:, kernels.IN_FRONT]
     # A copy, as a view would keep the equations of all pairs in memory.
     return Support(state.target, state.source, score, state.rows[:, kernels.TERMS].copy())

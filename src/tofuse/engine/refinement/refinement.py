@@ -29,7 +29,7 @@ from tofuse.engine.refinement.joint_alignment import (
 )
 from tofuse.engine.refinement.loop_drift import loop_gap
 from tofuse.engine.refinement.range_change import RangeChange
-from tofuse.engine.refinement.split_half import rms_motion, split_half_errors
+from tofuse.engine.refinement.split_half import split_half_errors
 from tofuse.engine.refinement.submaps import refine_submaps
 from tofuse.engine.stored_views import (
     CoarseView,
@@ -69,8 +69,7 @@ class Refinement:
     poses
         (N, 4, 4) T_world_camera; the first has not moved.
     kept
-        Whether it is accepted: only if the views support each other better. If their support is
-        the same but for chance, the poses stay, but the measurements are used.
+        Whether it is accepted: unless the views support each other less, but for chance.
     views, pairs
         Numbers of views and of pairs that were compared.
     moved_m, moved_rad
@@ -88,8 +87,6 @@ class Refinement:
         Pairs (i, j) of edges that do not come from the overlap of the two views.
     split_m, split_rad
         Rms errors of the poses by halves of the images (`split_half`); 0 unless kept.
-    disputed_m, disputed_rad
-        Rms motion to the poses that the measurements prefer, where the poses stayed.
     """
 
     poses: Float64
@@ -105,8 +102,6 @@ class Refinement:
     non_overlap_edges: tuple[tuple[int, int], ...] = ()
     split_m: float = 0.0
     split_rad: float = 0.0
-    disputed_m: float = 0.0
-    disputed_rad: float = 0.0
 
     @property
     def range_change(self) -> RangeChange | None:
@@ -265,19 +260,12 @@ class _Joint(Refiner):
         if support_fell(gain):  # the camera may be the cause
             return replace(unchanged, calibration_check=calibration)
         after = with_unsupported_views_fixed(before, refined.poses, gain < -MAX_LOSS)
-        disputed_m = disputed_rad = 0.0
-        if mean[1] < mean[0]:
-            # The poses were already at the optimum; the measurements give their covariances.
-            disputed_m, disputed_rad = rms_motion(before, after)
-            after = before
         split_m, split_rad = _mean_errors([split for _, split in evaluated])
         return replace(
             unchanged.accepted(positions, after),
             calibration_check=calibration,
             split_m=split_m,
             split_rad=split_rad,
-            disputed_m=disputed_m,
-            disputed_rad=disputed_rad,
             errors={name: float(refined.errors[_ERROR_INDEX[name]]) for name in options.calibrate},
             edges=pairwise_measurements([p.index for p in posed], refined),
         )

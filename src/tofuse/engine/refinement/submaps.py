@@ -195,7 +195,7 @@ def _or_unchanged(refined: Refined, start: Float64) -> Refined:
     T_i_j = se3.inverse(start[i]) @ start[j]
     return Refined(
         start, start, np.zeros_like(refined.errors), refined.pairs, refined.moved, refined.before,
-        refined.before, T_i_j, refined.information, refined.scales,
+        refined.before, T_i_j, refined.information, refined.scales, refined.shared,
     )  # fmt: skip
 
 

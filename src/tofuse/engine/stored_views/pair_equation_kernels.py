@@ -621,9 +621,16 @@ def _on_same_surfaces(block: Float32, T: Float64, tolerance: float, min_cosine: 
 
 @kernel
 def marginalise_shared_errors(
-    sums: Float64, correlation: Float64, variance: Float64, pairs: Int64, rows: Float64
+    sums: Float64,
+    correlation: Float64,
+    variance: Float64,
+    pairs: Int64,
+    cutoff: float,
+    rows: Float64,
 ) -> None:
     """Marginalise the patches' shared errors out of the normal equations of pairs, in place.
+
+    What they explain of the residuals is added to the support.
 
     Parameters
     ----------
@@ -635,16 +642,20 @@ def marginalise_shared_errors(
         (K,) variances of these errors, m^2.
     pairs
         (K,) indices of the pairs.
+    cutoff
+        Residual that has no weight, in standard deviations.
     rows
         (N, SIZE) equations of the pairs, see `pair_equations`; updated.
     """
     for k in range(len(pairs)):
-        _marginalise(sums[pairs[k]], correlation, variance[k], rows[pairs[k]])
+        explained = _marginalise(sums[pairs[k]], correlation, variance[k], rows[pairs[k]])
+        # The slope of the support (1 - r^2 / cutoff^2)^3 by the squared residual is its weight.
+        rows[pairs[k], SUPPORT] += 3 / cutoff**2 * explained
 
 
 @kernel
-def _marginalise(sums: Float64, correlation: Float64, variance: float, row: Float64) -> None:
-    """Do the same for one pair."""
+def _marginalise(sums: Float64, correlation: Float64, variance: float, row: Float64) -> float:
+    """Do the same for one pair; return by how much its weighted squared residuals decrease."""
     count = len(sums)
     R = np.zeros((count, 7))
     sqrt_weight = np.sqrt(sums[:, PATCH_WEIGHT])
@@ -676,3 +687,7 @@ def _marginalise(sums: Float64, correlation: Float64, variance: float, row: Floa
         for o in range(p, 6):
             for k in range(count):
                 row[index + o - p] -= R[k, 1 + p] * R[k, 1 + o] - Z[k, 1 + p] * Z[k, 1 + o]
+    explained = 0.0
+    for k in range(count):
+        explained += R[k, 0] ** 2 - Z[k, 0] ** 2
+    return explained

@@ -251,11 +251,12 @@ class DirectedPairs:
         """
         return self.options.shared > 0 and bool((self.scale_p > 0).any())
 
-    def discount_shared(self, poses: Float64) -> None:
-        """Remove the contribution of depth errors that patches share from the normal equations.
+    def shared_variance(self, poses: Float64) -> Float64:
+        """Return the (P,) variances of depth errors that patches share, m^2.
 
         `poses` (N, 4, 4) are those of the last `evaluate` with `by_patch`. See `shared_error`.
         """
+        variance = np.zeros(len(self.target))
         photometric = np.flatnonzero(self.scale_p > 0)
         T = se3.inverse(poses[self.target[photometric]]) @ poses[self.source[photometric]]
         depth = np.array([v.depth for v in self.views])[self.target[photometric]]
@@ -267,16 +268,29 @@ class DirectedPairs:
         disagreement = shared_error.disagreement(
             self.sums[sampled], self.rows[sampled], correlation
         )
-        variance = self.options.shared**2 * disagreement.variance(growth[sampled_rows]) * growth
-        if not variance.any():
-            return
+        at_growth_1 = self.options.shared**2 * disagreement.variance(growth[sampled_rows])
+        variance[photometric] = at_growth_1 * growth
+        return variance
+
+    def discount_shared(self, variance: Float64) -> None:
+        """Remove what errors explain that patches share, from the equations and the residuals.
+
+        `variance` (P,) is that of `shared_variance`, after an `evaluate` with `by_patch`.
+        """
+        correlation = shared_error.patch_correlation(self.views[0].shape)
+        pairs = np.flatnonzero(variance)
 
         def work(a: int, b: int) -> None:
             marginalise_shared_errors(
-                self.sums, correlation, variance[a:b], photometric[a:b], self.rows
+                self.sums,
+                correlation,
+                variance[pairs[a:b]],
+                pairs[a:b],
+                projective.ROBUST,
+                self.rows,
             )
 
-        run_chunks(work, len(photometric), -(-len(photometric) // _DISCOUNTED_A_CHUNK))
+        run_chunks(work, len(pairs), -(-len(pairs) // _DISCOUNTED_A_CHUNK))
 
     def without_exposure(self, errors: Sequence[int] = ()) -> tuple[Float64, Float64]:
         """Return normal equations of pairs without their exposure, which is eliminated and updated.
