@@ -22,7 +22,6 @@ _NEIGHBOURS = 30  # points of a local plane fit
 _MEDIANS_PER_CAP = 4.0  # the colour bar ends at this multiple of the median distance
 _MAX_SPACINGS = 3.0  # of a point from its counterpart, along the surface
 _Z_UP = ("las", "e57")  # formats of scanners and maps; cameras look along z
-_MIN_BEHIND = 0.1  # minimum fraction of points behind the origin that excludes a camera
 
 
 def write_pair_report(result: PairResult, path: Path) -> None:
@@ -96,9 +95,7 @@ def _is_z_up(view: SingleView) -> bool:
     """Whether z is up: in maps, and with scanners, which measure in all directions."""
     if not isinstance(view.frame, CloudFrame):
         return False
-    if view.format in _Z_UP or view.frame.shift.any():
-        return True
-    return _MIN_BEHIND <= float((view.frame.points[:, 2] < 0).mean()) <= 1 - _MIN_BEHIND
+    return view.format in _Z_UP or view.frame.z_is_up
 
 
 def distances(points: Float64, others: Float64, normals: Float64, reach: float) -> Float64:

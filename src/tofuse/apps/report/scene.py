@@ -105,9 +105,11 @@ class Scene:
         low, high = self.box
         cameras = self.after[:, :3, 3]
         cameras_in_box = cameras[((cameras >= low) & (cameras <= high)).all(1)]
+        # Clouds get sparse with the distance from the sensor.
+        outer = 0.5 if self.mesh is not None else 2.0
         extremes = [
             extreme_points(part, outer)
-            for part, outer in ((self.points, 0.5), (cameras_in_box, 0.0))
+            for part, outer in ((self.points, outer), (cameras_in_box, 0.0))
             if len(part)
         ]
         return np.concatenate(extremes) if extremes else np.stack([low, high])
@@ -348,7 +350,7 @@ def _cosines(points: Float64, normals: Float32 | Float64, eye: Float64) -> Float
     return np.asarray((unit_vectors(eye - points) * np.nan_to_num(normals)).sum(1), np.float64)
 
 
-def extreme_points(points: Float64, outer: float = 2.0) -> Float64:
+def extreme_points(points: Float64, outer: float) -> Float64:
     """Return the extreme points (K, 3) in many directions, without outliers, of a sample.
 
     Parameters
