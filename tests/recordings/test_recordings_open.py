@@ -55,6 +55,11 @@ def test_several_paths_are_joined_in_given_order(tmp_path: Path) -> None:
     assert twice.read(6).points[0, 2] == 2
 
 
+def test_topic_is_refused_where_nothing_selects_by_it(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^topic: does not apply to the format 'native'"):
+        open_recording(write(tmp_path, [1]), topic="/depth")
+
+
 def test_noise_model_of_all_parts_is_that_of_the_whole(tmp_path: Path) -> None:
     for name in "ab":
         write(tmp_path / name, [1])

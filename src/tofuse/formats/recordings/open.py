@@ -185,6 +185,12 @@ class _Located:
 
 
 def _opened(item: _Located, options: ReaderOptions) -> Source:
+    if options.topic is not None and not item.reader.has_topics:
+        raise InputError(
+            f"does not apply to the format {name_of(item.reader)!r}",
+            where="--topic",
+            remedy="leave it out",
+        )
     source = item.reader.open(item.path, options)
     _read_noise(source, item.path)
     return source
@@ -355,7 +361,8 @@ def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) ->
     elif path.stat().st_size == 0:
         return InputError("is empty", where=path, remedy="copy the file again")
     else:
-        problem = f"is not a recording of a known format, but a {path.suffix!r} file"
+        kind = f"a {path.suffix!r} file" if path.suffix else "a file without a suffix"
+        problem = f"is not a recording of a known format, but {kind}"
         remedy = _CLOUDS.get(path.suffix.lower(), remedy)
     folder = path.absolute().parent
     if _is_sure(folder):
