@@ -319,13 +319,10 @@ def test_two_readers_keep_the_order() -> None:
 
 
 def test_scans_that_are_not_read_are_named_with_a_remedy(tmp_path) -> None:
-    for name, remedy in (("0.txt", "rename the files to .xyz"), ("0.PTX", "export the scans")):
-        folder = tmp_path / name
-        folder.mkdir()
-        (folder / name).write_text("1 2 3\n")
-        for path in (folder, folder / name):
-            with pytest.raises(InputError, match=remedy):
-                open_recording(path)
+    (tmp_path / "0.txt").write_text("1 2 3\n")
+    for path in (tmp_path, tmp_path / "0.txt"):
+        with pytest.raises(InputError, match=r"rename the files to \.xyz"):
+            open_recording(path)
 
 
 def test_recording_pickled_for_another_process_is_opened_there(tmp_path: Path) -> None:

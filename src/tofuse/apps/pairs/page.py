@@ -21,7 +21,7 @@ MAX_POINTS = 45_000  # of each view; about 1 MB for both
 _NEIGHBOURS = 30  # points of a local plane fit
 _MEDIANS_PER_CAP = 4.0  # the colour bar ends at this multiple of the median distance
 _MAX_SPACINGS = 3.0  # of a point from its counterpart, along the surface
-_Z_UP = ("las", "e57")  # formats of scanners and maps; cameras look along z
+_Z_UP = ("las", "e57", "ptx")  # formats of scanners and maps; cameras look along z
 
 
 def write_pair_report(result: PairResult, path: Path) -> None:

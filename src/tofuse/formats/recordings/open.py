@@ -51,12 +51,9 @@ _ARCHIVES = {".zip", ".tar", ".gz", ".tgz", ".7z", ".rar"}
 # A single file of these, which contain a whole recording, is that of its folder.
 _CONTAINERS = (".bag", ".db3", ".mcap", ".mkv", ".sens", ".r3d", ".npz", ".h5", ".e57")
 # What to do with scans that are not read, by suffix.
-_CLOUDS = {
-    **dict.fromkeys(
-        (".txt", ".csv"), "if the lines are x y z of a cloud, rename the files to .xyz"
-    ),
-    ".ptx": "export the scans as .e57, .ply or .xyz",
-}
+_CLOUDS = dict.fromkeys(
+    (".txt", ".csv"), "if the lines are x y z of a cloud, rename the files to .xyz"
+)
 
 # A folder with these may contain depth images of an unknown camera.
 _IMAGES = (".png", ".pgm", ".tif", ".tiff", ".jpg", ".jpeg")
