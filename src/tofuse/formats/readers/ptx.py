@@ -79,7 +79,8 @@ def _scans(path: Path) -> list[_Scan]:
     """The scans of a file, which follow each other."""
     scans = []
     with reading.readable(path), path.open("rb") as file:
-        while head := list(islice((line for line in file if line.strip()), _HEADER_LINES)):
+        lines = (line for line in file if line.strip())
+        while (head := list(islice(lines, _HEADER_LINES))) or not scans:
             try:
                 columns, rows = int(head[0]), int(head[1])
                 if len(head) < _HEADER_LINES or not 1 <= columns <= _MAX_POINTS // max(rows, 1):
