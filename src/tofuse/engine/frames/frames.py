@@ -276,11 +276,13 @@ class CloudFrame:
 
     def __post_init__(self) -> None:
         _check_frame(self)
-        if np.ndim(self.points) != 2 or np.shape(self.points)[1] != 3:
+        is_array = isinstance(self.points, np.ndarray)
+        if not is_array or self.points.ndim != 2 or self.points.shape[1] != 3:
+            given = (
+                f"shape {self.points.shape}" if is_array else f"type {type(self.points).__name__}"
+            )
             raise InputError(
-                f"points have shape {np.shape(self.points)}",
-                where=f"frame {self.index}",
-                remedy="pass an (N, 3) array",
+                f"points have {given}", where=f"frame {self.index}", remedy="pass an (N, 3) array"
             )
         largest = np.abs(self.points).max(initial=0)
         if largest > se3.MAX_COORDINATE_M:

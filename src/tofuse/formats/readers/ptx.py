@@ -77,7 +77,7 @@ class _Scan:
 
 def _scans(path: Path) -> list[_Scan]:
     """The scans of a file, which follow each other."""
-    scans = []
+    scans: list[_Scan] = []
     with reading.readable(path), path.open("rb") as file:
         lines = (line for line in file if line.strip())
         while (head := list(islice(lines, _HEADER_LINES))) or not scans:
