@@ -20,6 +20,7 @@ COLORS = {"source": (240, 160, 60), "target": (90, 176, 245)}
 MAX_POINTS = 45_000  # of each view; about 1 MB for both
 _NEIGHBOURS = 30  # points of a local plane fit
 _MEDIANS_PER_CAP = 4.0  # the colour bar ends at this multiple of the median distance
+_OUTER = 2.0  # percentage at each end out of view: views thin out with the distance, unlike models
 _MAX_SPACINGS = 3.0  # of a point from its counterpart, along the surface
 _Z_UP = ("las", "e57", "ptx")  # formats of scanners and maps; cameras look along z
 
@@ -79,6 +80,7 @@ def pair_scene(result: PairResult) -> tuple[scene.Scene, fields.Field]:
         np.concatenate(normals),
         sum(map(len, views)),
         spacing,
+        outer=_OUTER,
     )
     reach = _MAX_SPACINGS * spacing
     distance = np.concatenate(

@@ -56,6 +56,8 @@ class Scene:
     sigma, views
         (K,) standard deviation of the points, m, and (K,) number of views that observed them; None
         if unknown.
+    outer
+        Percentage of the points at each end of each axis that needn't be in view at first.
     """
 
     points: Float64
@@ -71,6 +73,7 @@ class Scene:
     texture: Textured | None = None
     sigma: Float32 | None = None
     views: Int32 | None = None
+    outer: float = 0.5
 
     @cached_property
     def mesh(self) -> Mesh | None:
@@ -105,11 +108,9 @@ class Scene:
         low, high = self.box
         cameras = self.after[:, :3, 3]
         cameras_in_box = cameras[((cameras >= low) & (cameras <= high)).all(1)]
-        # Clouds get sparse with the distance from the sensor.
-        outer = 0.5 if self.mesh is not None else 2.0
         extremes = [
             extreme_points(part, outer)
-            for part, outer in ((self.points, outer), (cameras_in_box, 0.0))
+            for part, outer in ((self.points, self.outer), (cameras_in_box, 0.0))
             if len(part)
         ]
         return np.concatenate(extremes) if extremes else np.stack([low, high])
