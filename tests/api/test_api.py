@@ -199,7 +199,9 @@ def test_evaluate_accepts_files_and_arrays(result, arrays, tmp_path):
         loaded.evaluate()
     recording = tofuse.from_arrays(*arrays[:2], reference=poses)
     assert loaded.evaluate(recording).error.ate_rms_m == pytest.approx(by_array)
-    assert tofuse.evaluate(loaded, recording).error.ate_rms_m == pytest.approx(by_array)
+    for estimate in (loaded, result.trajectory):  # whose times are those of the recording
+        by_recording = tofuse.evaluate(estimate, recording)
+        assert by_recording.error.ate_rms_m == pytest.approx(by_array)
     with pytest.raises(tofuse.InputError, match="reference: has no reference poses"):
         loaded.evaluate(tofuse.from_arrays(*arrays[:2]))
 
@@ -409,7 +411,8 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: result.mesh.save(None), r"path: is a NoneType.*ends in one of \.glb"),
         (lambda: result.cloud.save(3), r"path: is a int.*ends in one of \.ply"),
         (lambda: tofuse.merge([result, result]), r"results: is a Result.*save\(folder\)"),
-        (lambda: tofuse.merge("result"), "results: is a single path"),
+        (lambda: tofuse.merge("result"), "results: is not several paths"),
+        (lambda: tofuse.merge(None), "results: is not several paths"),
         (lambda: tofuse.merge([], tolerance_m="x"), "tolerance_m: "),
         (lambda: tofuse.compare(None, result), "is a NoneType, not a path; pass a result"),
         (lambda: result.save("a\0b"), r"folder: is 'a\\x00b', not a path"),
@@ -432,6 +435,7 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: tofuse.compare(result, result, tolerance_m="2mm"), "tolerance_m: is '2mm'"),
         (lambda: result.distance(None, [0, 0, 0]), "are not two different points"),
         (lambda: tofuse.register(*recording[:2], guess="eye"), "guess: is not a matrix"),
+        (lambda: tofuse.CloudFrame(0, 0.0, far.tolist()), "frame 0: points have type list"),
         (lambda: tofuse.CloudFrame(0, 0.0, far), r"coordinates up to 1e\+20"),
         (lambda: cloud(origin=np.full(3, np.nan)), "frame 0: origin"),
         (lambda: cloud(normals=np.ones((3, 3))), "frame 0: normals: has shape"),

@@ -89,10 +89,12 @@ def test_motions_are_compared_by_length_and_angle() -> None:
 
 def test_largest_sigmas_are_those_of_the_worst_directions() -> None:
     R = se3.so3_exp(np.array([0.3, -0.5, 0.2]))
-    C = np.zeros((2, 6, 6))
+    C = np.zeros((3, 6, 6))
     C[0, :3, :3] = R @ np.diag([1e-4, 9e-4, 4e-4]) @ R.T
     C[0, 3:, 3:] = np.diag([1e-6, 0, 0])
-    np.testing.assert_allclose(se3.largest_sigmas(C), [[0.03, 0.001], [0, 0]], atol=1e-12)
+    C[2, :3] = np.nan  # a position that nothing measured
+    expected = [[0.03, 0.001], [0, 0], [np.nan, 0]]
+    np.testing.assert_allclose(se3.largest_sigmas(C), expected, atol=1e-12)
 
 
 def test_functions_broadcast_over_stacks() -> None:

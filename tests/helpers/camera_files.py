@@ -82,6 +82,7 @@ OTHERS: dict[str, tuple[Callable[[Path], object], str | None, str]] = {
     "ply": (damaged_files.make_ply, None, "ply"),
     "xyz": (damaged_files.make_xyz, None, "xyz"),
     "slam6d": (damaged_files.make_slam6d, None, "slam6d"),
+    "ptx": (damaged_files.make_ptx, None, "ptx"),
     "h5": (made_ifm.make_h5, "a.h5", "ifm-h5"),
     "mcap": (make_mcap, "a", "ros"),
     "realsense": (make_realsense, "a.bag", "realsense-bag"),

@@ -73,6 +73,16 @@ def make_slam6d(folder: Path) -> None:
         (folder / f"scan{k:03d}.pose").write_text("1 2 3\n4 5 6\n")
 
 
+def make_ptx(folder: Path) -> None:
+    """Two scans in one file, of 2 x 3 points each, and one in another."""
+    folder.mkdir()
+    header = "2\n3\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n0 1 0 0\n-1 0 0 0\n0 0 1 0\n5 6 7 1\n"
+    plain = header + "".join(f"{k} {k + 1} {k + 2} 0.{k}\n" for k in range(1, 6)) + "0 0 0 0.5\n"
+    colors = header + "".join(f"{k} 2 3 0.5 10 20 {k}\n" for k in range(6))
+    (folder / "a.ptx").write_text(plain + colors)
+    (folder / "b.ptx").write_text(plain)
+
+
 def damage(files: list[Path], rng: np.random.Generator) -> None:
     path = files[rng.integers(len(files))]
     data = bytearray(path.read_bytes())

@@ -304,6 +304,16 @@ def test_clouds_alone_give_a_model(frames) -> None:
     assert result.cloud.color is None
 
 
+def test_clouds_all_around_have_z_up(frames) -> None:
+    """Of scanners, while cameras look along z."""
+    points = frames[0].points[::6]
+    axes = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])  # x forward, y left, z up
+    for turned, up in ((points, [0, -1, 0]), (points @ axes.T, [0, 0, 1])):
+        assert CloudFrame.of(turned).z_is_up == (up[2] == 1)
+        result = reconstruct(in_memory([CloudFrame.of(turned)]))
+        np.testing.assert_allclose(result.T_up_world[1, :3], up, atol=0.02)
+
+
 def test_given_tracker_tracks_clouds_too(frames) -> None:
     """An interrupted run goes on with one that repeats what was tracked."""
     clouds = [CloudFrame.of(f.points[::6], index=f.index, timestamp=f.index) for f in frames[:2]]

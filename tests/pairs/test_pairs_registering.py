@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -59,8 +60,9 @@ def test_meshes_clouds_and_frames_are_taken() -> None:
     source, target = stone(3000, 1), stone(3000, 0)
     cloud = Cloud(target.astype(np.float32), None, None, np.ones(3000, np.int32))
     by_array = tofuse.register(source, target)
-    by_cloud = tofuse.register(source, cloud)
-    np.testing.assert_array_equal(by_array.T_target_source, by_cloud.T_target_source)
+    for view in (cloud, SimpleNamespace(points=target)):  # the other is as one of Open3D
+        by_cloud = tofuse.register(source, view)
+        np.testing.assert_array_equal(by_array.T_target_source, by_cloud.T_target_source)
 
 
 def test_result_is_its_cloud(room_result, capfd) -> None:
@@ -152,10 +154,21 @@ def test_large_clouds_may_be_in_mm(tmp_path, capfd) -> None:
         assert ("if the files are in mm" in capfd.readouterr().out) == says
 
 
+def test_unit_does_not_matter() -> None:
+    metres, large = (
+        tofuse.register(scale * stone(3000, 1), scale * stone(3000, 0)) for scale in (1.0, 1e6)
+    )
+    assert metres.believed
+    assert large.believed
+    moved = large.T_target_source.copy()
+    moved[:3, 3] /= 1e6
+    assert error(metres, moved)[0] < 0.01
+
+
 @pytest.mark.parametrize(
     ("view", "says"),
     [
-        ({"a": 1}, "source: is a dict of shape () and type object; pass a frame"),
+        ({"a": 1}, "source: is a dict; pass a frame"),
         ("none.ply", "none.ply: doesn't exist"),
         (Mesh.of(GeometryRecord(np.zeros((20, 3)), np.zeros((4, 3), np.int32))), "without area"),
         (Mesh.of(GeometryRecord(np.eye(3))), "source: has 3 finite points; use 10 or more"),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import tofuse
+from damaged_files import make_ptx
 from made_phones import jpeg
 from made_sens import BASELINE_M, COLORS, DEPTH, HEIGHT, WIDTH, make_scannet, make_sens, pose
 from tofuse.engine.errors import InputError, UnreadableFrameError
@@ -264,3 +265,16 @@ def test_damaged_scans_are_refused_in_one_line(tmp_path: Path) -> None:
         with pytest.raises(InputError) as caught:
             tofuse.open(tmp_path / name)
         assert len(str(caught.value).splitlines()) == 1
+
+
+def test_ptx_states_poses_for_row_vectors(tmp_path: Path) -> None:
+    """Several scans follow each other, and a zero is a direction without a measurement."""
+    make_ptx(tmp_path / "scans")
+    recording = tofuse.open(tmp_path / "scans")
+    first, second, third = recording
+    np.testing.assert_array_equal(first.points, [[k, k + 1, k + 2] for k in range(1, 6)])
+    np.testing.assert_allclose(first.amplitude, [0.1, 0.2, 0.3, 0.4, 0.5])
+    np.testing.assert_array_equal(second.color, [[10, 20, k] for k in range(6)])
+    np.testing.assert_array_equal(third.points, first.points)
+    T = [[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]]
+    np.testing.assert_allclose(recording.reference, [T] * 3)

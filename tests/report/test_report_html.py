@@ -456,6 +456,12 @@ def test_plan_shows_outline_extents_and_path_in_pixels():
     assert p["names"] == ["right, m", "forward, m"]
 
 
+def test_model_without_colours_begins_with_its_shape(tmp_path):
+    """What the accuracy looks like is for specialists."""
+    text = page(tmp_path, lonely(), ReportExtras("x")).text
+    assert re.search(r'name="by"[^>]*><option value="">Shape</option>', text)
+
+
 def test_model_can_be_coloured_by_attributes_of_points():
     points = np.array([[0, -2.0, 1], [0, -1, 1], [0, 0, 1], [1, 0, 2]], np.float32)
     cloud = Cloud(

@@ -35,6 +35,14 @@ def sheet(seed: int, low: float = 0.0, high: float = 1.0, z: float = 1.0) -> np.
     return np.column_stack([flat, z + rng.normal(0, 0.003, len(flat))])
 
 
+def test_far_sparse_points_do_not_decide_what_is_framed() -> None:
+    rng = np.random.default_rng(1)
+    ranges = rng.exponential(2.0, 20_000)[:, None]  # as the points of a scanner thin out
+    points = ranges * rng.normal(size=(20_000, 3)) * [1, 1, 0.1]
+    scene, _ = pair_scene(pair(points, points, np.eye(4)))
+    assert np.ptp(scene.framed, axis=0)[0] < 0.2 * np.ptp(points[:, 0])
+
+
 def test_distances_are_from_surfaces_not_points() -> None:
     ours, theirs = sheet(1, z=1.012), sheet(2)
     up = np.tile([0.0, 0, 1], (len(theirs), 1))

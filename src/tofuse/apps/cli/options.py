@@ -537,8 +537,8 @@ class Card(Written, Json, Edited):
     Exit status
     -----------
     0  no quantity changes with time by more than its uncertainty
-    2  nothing was written: one line on stderr states the reason
     3  a quantity changes with time
+    2  nothing was written: one line on stderr states the reason
     """
 
     home = "tofuse.apps.cli.comparing"

@@ -165,7 +165,10 @@ class Comparison:
     def sentence(self) -> str:
         """What was found, in a few sentences."""
         places = self.deviations.places
-        worst = int(np.abs(places.deviation).argmax())
+        limit_m = self.tolerance_m
+        certain = places.changed if limit_m is None else places.verdicts(limit_m) < 0
+        # Where any is certain, an uncertain one is not the largest.
+        worst = int((np.abs(places.deviation) * (certain | ~certain.any())).argmax())
         at = ", ".join(f"{1e3 * v:z.0f}" for v in places.centres[worst])
         largest = (
             f"{millimetres(places.deviation[worst])} \N{PLUS-MINUS SIGN} "

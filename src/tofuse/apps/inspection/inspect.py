@@ -152,7 +152,7 @@ def _facts(recording: Recording, frames: Sequence[Frame]) -> dict[str, str]:
     return facts | {
         name: shown(str(value))
         for name, value in recording.metadata.items()
-        if isinstance(value, str | int | float) and name != "depth_kind"
+        if isinstance(value, str | int | float) and value is not False and name != "depth_kind"
     }
 
 

@@ -210,13 +210,12 @@ def _correctors(
 
 def _clock_of_recording(source: Poses) -> Clock | None:
     """Return the clock of the recording that poses are read from; None if they are of none."""
-    if not isinstance(source, str | Path):
-        return None
-    try:
-        recording = open_recording(source)
-    except InputError:
-        return None
-    return recording.timestamps, recording.indices
+    if isinstance(source, str | Path):
+        try:
+            source = open_recording(source)
+        except InputError:
+            return None
+    return (source.timestamps, source.indices) if isinstance(source, Recording) else None
 
 
 def _poses(source: Poses, name: str, *, is_reference: bool = False) -> TimedPoses:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, count
 from pathlib import Path
@@ -71,8 +71,8 @@ def read_sessions(
         or if a result was given twice, or only one session.
     """
     remedy = "pass folders, to which result.save(folder) writes results"
-    if isinstance(results, str | Path):
-        raise InputError("is a single path", where="results", remedy=remedy)
+    if isinstance(results, str) or not isinstance(results, Iterable):
+        raise InputError("is not several paths", where="results", remedy=remedy)
     folders = [reading.path_of(each, "results", remedy) for each in results]
     for a, b in combinations(folders, 2):
         if a.resolve() == b.resolve():

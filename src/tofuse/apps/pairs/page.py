@@ -20,9 +20,9 @@ COLORS = {"source": (240, 160, 60), "target": (90, 176, 245)}
 MAX_POINTS = 45_000  # of each view; about 1 MB for both
 _NEIGHBOURS = 30  # points of a local plane fit
 _MEDIANS_PER_CAP = 4.0  # the colour bar ends at this multiple of the median distance
+_OUTER = 2.0  # percentage at each end out of view: views thin out with the distance, unlike models
 _MAX_SPACINGS = 3.0  # of a point from its counterpart, along the surface
-_Z_UP = ("las", "e57")  # formats of scanners and maps; cameras look along z
-_MIN_BEHIND = 0.1  # minimum fraction of points behind the origin that excludes a camera
+_Z_UP = ("las", "e57", "ptx")  # formats of scanners and maps; cameras look along z
 
 
 def write_pair_report(result: PairResult, path: Path) -> None:
@@ -80,6 +80,7 @@ def pair_scene(result: PairResult) -> tuple[scene.Scene, fields.Field]:
         np.concatenate(normals),
         sum(map(len, views)),
         spacing,
+        outer=_OUTER,
     )
     reach = _MAX_SPACINGS * spacing
     distance = np.concatenate(
@@ -96,9 +97,7 @@ def _is_z_up(view: SingleView) -> bool:
     """Whether z is up: in maps, and with scanners, which measure in all directions."""
     if not isinstance(view.frame, CloudFrame):
         return False
-    if view.format in _Z_UP or view.frame.shift.any():
-        return True
-    return _MIN_BEHIND <= float((view.frame.points[:, 2] < 0).mean()) <= 1 - _MIN_BEHIND
+    return view.format in _Z_UP or view.frame.z_is_up
 
 
 def distances(points: Float64, others: Float64, normals: Float64, reach: float) -> Float64:

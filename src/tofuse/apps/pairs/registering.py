@@ -51,9 +51,10 @@ def register(
     Parameters
     ----------
     source, target
-        Frames of a recording; (N, 3) points in m, of which non-finite ones are dropped; a `Cloud`;
-        a `Mesh`, sampled evenly by area; a `Reconstruction`: its cloud. Or the path of a result, of
-        a mesh (.ply, .obj, .stl, .glb; m) or of a view as in ``tofuse register``.
+        Frames of a recording; (N, 3) points in m, of which non-finite ones are dropped; an object
+        with `points`, such as a `Cloud` or one of Open3D; a `Mesh`, sampled evenly by area; a
+        `Reconstruction`: its cloud. Or the path of a result, of a mesh (.ply, .obj, .stl, .glb; m)
+        or of a view as in ``tofuse register``.
     guess
         (4, 4) T_target_source to start from; the identity unless given. Of ambiguous poses the one
         at the guess is returned.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TypeAlias
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,13 +14,23 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds import MIN_POINTS
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
-from tofuse.engine.fusion import Cloud, Mesh
+from tofuse.engine.fusion import Mesh
 from tofuse.engine.geometry import se3
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.geometry import surface_points
 from tofuse.formats.recordings import SingleView, open_view
 
-View: TypeAlias = Frame | Reconstruction | Mesh | Cloud | ArrayLike | str | os.PathLike[str]
+
+@runtime_checkable
+class HasPoints(Protocol):
+    """A `Cloud`, or one of another package, such as Open3D."""
+
+    @property
+    def points(self) -> ArrayLike:
+        """(N, 3) m."""
+
+
+View: TypeAlias = Frame | Reconstruction | Mesh | HasPoints | ArrayLike | str | os.PathLike[str]
 
 
 def view_of(view: View, name: str) -> Frame:
@@ -46,7 +56,7 @@ def view_of(view: View, name: str) -> Frame:
         return CloudFrame.of(_checked(view.cloud.points + view.shift, name))
     if isinstance(view, Mesh):
         return CloudFrame.of(_checked(surface_points(view.record(), name), name))
-    return CloudFrame.of(_checked(view.points if isinstance(view, Cloud) else view, name))
+    return CloudFrame.of(_checked(view.points if isinstance(view, HasPoints) else view, name))
 
 
 def named_view(
@@ -72,8 +82,9 @@ def _checked(points: ArrayLike, name: str) -> Float64:
     except ValueError as error:
         raise InputError("is not an array", where=name, remedy="pass (N, 3) numbers") from error
     if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
+        kind = f" of shape {array.shape} and type {array.dtype}" if array.ndim else ""
         raise InputError(
-            f"is a {type(points).__name__} of shape {array.shape} and type {array.dtype}",
+            f"is a {type(points).__name__}{kind}",
             where=name,
             remedy="pass a frame (recording[0]), a result, a mesh, (N, 3) numbers in metres, or "
             "the path of one of these",

@@ -56,6 +56,8 @@ class Scene:
     sigma, views
         (K,) standard deviation of the points, m, and (K,) number of views that observed them; None
         if unknown.
+    outer
+        Percentage of the points at each end of each axis that needn't be in view at first.
     """
 
     points: Float64
@@ -71,6 +73,7 @@ class Scene:
     texture: Textured | None = None
     sigma: Float32 | None = None
     views: Int32 | None = None
+    outer: float = 0.5
 
     @cached_property
     def mesh(self) -> Mesh | None:
@@ -107,7 +110,7 @@ class Scene:
         cameras_in_box = cameras[((cameras >= low) & (cameras <= high)).all(1)]
         extremes = [
             extreme_points(part, outer)
-            for part, outer in ((self.points, 0.5), (cameras_in_box, 0.0))
+            for part, outer in ((self.points, self.outer), (cameras_in_box, 0.0))
             if len(part)
         ]
         return np.concatenate(extremes) if extremes else np.stack([low, high])
@@ -348,7 +351,7 @@ def _cosines(points: Float64, normals: Float32 | Float64, eye: Float64) -> Float
     return np.asarray((unit_vectors(eye - points) * np.nan_to_num(normals)).sum(1), np.float64)
 
 
-def extreme_points(points: Float64, outer: float = 2.0) -> Float64:
+def extreme_points(points: Float64, outer: float) -> Float64:
     """Return the extreme points (K, 3) in many directions, without outliers, of a sample.
 
     Parameters

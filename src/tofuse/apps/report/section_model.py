@@ -35,7 +35,6 @@ def model(s: Subject) -> Values:
         rig = None
     names = rig["cameras"] if rig else ()
     colors = [CAMERA_COLORS[k % len(CAMERA_COLORS)] for k in range(len(names))]
-    color_source = _color_source(s)
     if scene.mesh is not None:
         total = 0 if s.result.mesh is None else len(s.result.mesh.faces)
         thinned = words.thinned(len(scene.mesh.faces), total, "triangles")
@@ -60,7 +59,7 @@ def model(s: Subject) -> Values:
             **{name: len(getattr(scene, name)) for name in _SWITCHED},
         },
         "colorings": [
-            *([("", color_source)] if color_source else []),
+            ("", _color_source(s)),
             *((field.name, field.label) for field in shown),
         ],
         "cameras": list(zip(names, colors, strict=True)),
@@ -69,11 +68,11 @@ def model(s: Subject) -> Values:
 
 
 def _color_source(s: Subject) -> str:
-    """The source of the model's colours: colour images or amplitude; empty without any."""
+    """The source of the model's colours: colour images, amplitude, or heights, shaded."""
     mesh = s.scene.mesh
     color = s.result.cloud.color if mesh is None else mesh.color
     if color is None or not len(color):
-        return ""
+        return "Shape"
     grey = bool((np.ptp(color, axis=1) == 0).all())
     return "Amplitude" if grey else "Colour"
 

@@ -56,7 +56,7 @@ class ConsensusOptions(Bounded):
     sigmas: Annotated[float, Bounds(0, 1000, exclusive=True)] = 3.0
     inliers: Annotated[int, Bounds(3, 1_000_000)] = 6
     seeds: Annotated[int, Bounds(1, 1_000_000)] = 100
-    distinct_m: Annotated[float, Bounds(0, 1000, exclusive=True)] = 0.1
+    distinct_m: Annotated[float, Bounds(0, exclusive=True)] = 0.1
     distinct_rad: Annotated[float, Bounds(0, 1000, exclusive=True)] = 0.0873
 
 

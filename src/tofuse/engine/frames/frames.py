@@ -25,6 +25,8 @@ DepthKind = Literal["z", "range"]
 AmplitudeKind = Literal["raw", "range_compensated", "ir"]
 
 SATURATED_AMPLITUDE = 65535.0
+# Minimum fraction of points behind the origin that excludes a camera.
+_MIN_BEHIND = 0.1
 
 
 # Names of all images of a `RangeFrame`, which have one size.
@@ -274,11 +276,13 @@ class CloudFrame:
 
     def __post_init__(self) -> None:
         _check_frame(self)
-        if np.ndim(self.points) != 2 or np.shape(self.points)[1] != 3:
+        is_array = isinstance(self.points, np.ndarray)
+        if not is_array or self.points.ndim != 2 or self.points.shape[1] != 3:
+            given = (
+                f"shape {self.points.shape}" if is_array else f"type {type(self.points).__name__}"
+            )
             raise InputError(
-                f"points have shape {np.shape(self.points)}",
-                where=f"frame {self.index}",
-                remedy="pass an (N, 3) array",
+                f"points have {given}", where=f"frame {self.index}", remedy="pass an (N, 3) array"
             )
         largest = np.abs(self.points).max(initial=0)
         if largest > se3.MAX_COORDINATE_M:
@@ -355,6 +359,15 @@ class CloudFrame:
             )
         ranges: Float64 = np.linalg.norm(self.points - self.origin, axis=1)
         return ranges
+
+    @property
+    def z_is_up(self) -> bool:
+        """Whether z is up: in map coordinates, and if the sensor measured in all directions.
+
+        Cameras look along z.
+        """
+        behind = float((self.points[:, 2] < self.origin[2]).mean()) if len(self) else 0.0
+        return bool(self.shift.any()) or _MIN_BEHIND <= behind <= 1 - _MIN_BEHIND
 
     def relative_to(self, shift: Float64) -> Self:
         """Return the view with another `shift` (3,), m, of the same coordinates of the file."""

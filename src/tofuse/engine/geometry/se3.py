@@ -210,16 +210,18 @@ def change_of_view(T: ArrayLike, depth: ArrayLike) -> Float64:
 
 
 def largest_sigmas(C: ArrayLike) -> Float64:
-    """Standard deviations, m and rad, (..., 2) in the worst directions.
+    """Standard deviations, m and rad, (..., 2) in the worst directions; NaN where unknown.
 
     Parameters
     ----------
     C
-        (..., 6, 6) covariances of twists.
+        (..., 6, 6) covariances of twists, NaN where unknown.
     """
     C = np.asarray(C, float)
     blocks = np.stack([C[..., :3, :3], C[..., 3:, 3:]], axis=-3)
-    return np.sqrt(np.linalg.eigvalsh(blocks)[..., -1].clip(0))
+    known = np.isfinite(blocks).all((-2, -1))
+    variances = np.linalg.eigvalsh(np.where(known[..., None, None], blocks, 0.0))[..., -1]
+    return np.where(known, np.sqrt(variances.clip(0)), np.nan)
 
 
 def check_pose(T: ArrayLike, *, where: str = "pose") -> Float64:

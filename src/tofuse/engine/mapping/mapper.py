@@ -95,6 +95,7 @@ class Mapper:
         self._log = FrameLog()
         self._finished = False
         self._shift: Float64 = np.zeros(3)
+        self._up: Float64 | None = None
         self._given_tracker, self._colors = tracker, colors
         self._start_method()
         self._progress.began(self.so_far)
@@ -319,7 +320,8 @@ class Mapper:
             removed=self._preparation.counts.fractions,
             samples=self._observations.samples.all,
         )
-        return replace(result, diagnostics=diagnostics, shift=self._shift)
+        up = self._up if result.up is None else result.up
+        return replace(result, diagnostics=diagnostics, shift=self._shift, up=up)
 
     def _check(self, frame: Frame, T_odometry: Float64 | None) -> tuple[Frame, Float64 | None]:
         """Return the frame and the odometry, those of clouds relative to the first one's shift."""
@@ -333,9 +335,10 @@ class Mapper:
         self._sequence.check_order(frame.index)
         kind = kind_of(frame)
         if self._sequence.check_kind(frame):
-            if kind == "cloud":
+            if isinstance(frame, CloudFrame):
                 self.config = configured(self._given, kind)
                 self._shift = frame.shift
+                self._up = np.array([0.0, 0.0, 1.0]) if frame.z_is_up else None
                 self._prior_loops = tuple(p.about(-self._shift) for p in self._prior_loops)
                 self._start_method()
             check_views(self.config, kind)

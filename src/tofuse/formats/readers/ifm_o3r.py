@@ -272,6 +272,8 @@ _MAX_FRAMES, _MAX_ROW_BYTES = 1 << 20, 1 << 26  # per file, and per frame
 class IfmH5(Reader):
     """A .h5 or .hdf5 of ifm's Vision Assistant: range, noise, amplitude, lens (extra `hdf5`)."""
 
+    has_topics = True
+
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         matches = inputs.begins_with(inputs.file_of(path, ".h5", ".hdf5"), _MAGIC)

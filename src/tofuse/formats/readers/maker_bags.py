@@ -50,12 +50,6 @@ class MakerBagSource(bags.BagSource):
 
     def find_streams(self, options: ReaderOptions) -> None:
         """See `BagSource.find_streams`."""
-        if options.topic is not None:
-            raise InputError(
-                "does not apply to this maker's bags",
-                where="--topic",
-                remedy="omit it, or use --format ros",
-            )
         self.find_tracks()
         if options.camera is None:
             self.camera = self.lens()

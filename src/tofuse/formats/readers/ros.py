@@ -42,6 +42,8 @@ _ODOMETRY = "odom"
 class Ros(Reader):
     """ROS 1 and 2: a .bag, .db3 or .mcap, or a bag's folder; depth or clouds (extra `ros`)."""
 
+    has_topics = True
+
     def sniff(self, path: Path) -> Sniff | None:
         """See `Reader.sniff`."""
         kind = bags.bag_kind(path)

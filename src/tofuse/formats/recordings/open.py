@@ -51,12 +51,9 @@ _ARCHIVES = {".zip", ".tar", ".gz", ".tgz", ".7z", ".rar"}
 # A single file of these, which contain a whole recording, is that of its folder.
 _CONTAINERS = (".bag", ".db3", ".mcap", ".mkv", ".sens", ".r3d", ".npz", ".h5", ".e57")
 # What to do with scans that are not read, by suffix.
-_CLOUDS = {
-    **dict.fromkeys(
-        (".txt", ".csv"), "if the lines are x y z of a cloud, rename the files to .xyz"
-    ),
-    ".ptx": "export the scans as .e57, .ply or .xyz",
-}
+_CLOUDS = dict.fromkeys(
+    (".txt", ".csv"), "if the lines are x y z of a cloud, rename the files to .xyz"
+)
 
 # A folder with these may contain depth images of an unknown camera.
 _IMAGES = (".png", ".pgm", ".tif", ".tiff", ".jpg", ".jpeg")
@@ -185,6 +182,12 @@ class _Located:
 
 
 def _opened(item: _Located, options: ReaderOptions) -> Source:
+    if options.topic is not None and not item.reader.has_topics:
+        raise InputError(
+            f"does not apply to the format {name_of(item.reader)!r}",
+            where="--topic",
+            remedy="leave it out",
+        )
     source = item.reader.open(item.path, options)
     _read_noise(source, item.path)
     return source
@@ -355,7 +358,8 @@ def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) ->
     elif path.stat().st_size == 0:
         return InputError("is empty", where=path, remedy="copy the file again")
     else:
-        problem = f"is not a recording of a known format, but a {path.suffix!r} file"
+        kind = f"a {path.suffix!r} file" if path.suffix else "a file without a suffix"
+        problem = f"is not a recording of a known format, but {kind}"
         remedy = _CLOUDS.get(path.suffix.lower(), remedy)
     folder = path.absolute().parent
     if _is_sure(folder):

@@ -56,10 +56,13 @@ class Reader(Protocol):
     ----------
     joinable
         Whether a folder of such recordings is joined to one recording, in name order.
+    has_topics
+        Whether `ReaderOptions.topic` selects one of several streams.
     """
 
     part_kind: ClassVar[str] = "reader"
     joinable: ClassVar[bool] = False
+    has_topics: ClassVar[bool] = False
 
     def sniff(self, path: Path) -> Sniff | None:
         """Detect the format from names and first bytes; None if it is another one.
