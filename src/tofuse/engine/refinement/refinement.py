@@ -14,6 +14,7 @@ from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import Measured, PoseGraph, external_sensors
 from tofuse.engine.parts import part
+from tofuse.engine.refinement import fixed_pattern
 from tofuse.engine.refinement.calibration_check import (
     CalibrationCheck,
     check_calibration,
@@ -276,6 +277,9 @@ class _Joint(Refiner):
         views = [self._sampled(p) for p in posed]
         priors = _priors([p.index for p in posed], sensors)
         alignment = self._options.alignment
+        pattern = fixed_pattern.estimate(views, poses, alignment)
+        for k, view in enumerate(views):
+            views[k] = pattern.corrected(view)
         refined = refine(views, poses, alignment, calibrate=self._error_indices, priors=priors)
         aligned = RefinedViews(views, refined, alignment, priors, self._error_indices)
         return refined, [self._evaluate(aligned)]
@@ -284,12 +288,16 @@ class _Joint(Refiner):
         self, posed: _Views, poses: Float64, sensors: external_sensors.SensorPriors
     ) -> tuple[Refined, list[_Evaluation]]:
         ids = [p.index for p in posed]
+        some = fixed_pattern.runs_of_views(len(posed), self._options.submap)
+        sampled = [self._sampled(posed[k]) for k in some]
+        pattern = fixed_pattern.estimate(sampled, poses[some], self._options.alignment)
+        del sampled
         return refine_submaps(
             [self._coarse(p) for p in posed],
             poses,
             self._options.alignment,
             self._options.submap,
-            lambda subset: [self._sampled(posed[k]) for k in subset],
+            lambda subset: [pattern.corrected(self._sampled(posed[k])) for k in subset],
             lambda subset: _priors(ids if subset is None else [ids[k] for k in subset], sensors),
             self._evaluate,
             self._error_indices,

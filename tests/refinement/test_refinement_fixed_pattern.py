@@ -1,0 +1,90 @@
+"""Depth errors that are fixed to the camera, estimated from views of a corner."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from aligned_surfaces import OPTIONS, away, path
+from corner_views import CAMERA, SHARP, corner
+from tofuse.engine.refinement import fixed_pattern
+from tofuse.engine.refinement.joint_alignment import refine
+from tofuse.engine.stored_views.view_store import SampledView
+from tofuse.engine.views.prepared_view import prepare_view
+
+V, U = np.indices((CAMERA.height, CAMERA.width)) + 0.5
+ACROSS, DOWN = np.pi * U / CAMERA.width, np.pi * V / CAMERA.height
+PATTERN = 0.004 * np.cos(2 * ACROSS) * np.cos(DOWN) - 0.003 * np.cos(3 * ACROSS)
+"""Errors of the depth, m."""
+
+
+def views(poses, errors, noise: float = 0.002) -> list[SampledView]:
+    """Views of the corner with depth errors, one image for all or one for each."""
+    rng = np.random.default_rng(3)
+    errors = np.broadcast_to(errors, (len(poses), *PATTERN.shape))
+    found = []
+    for k, T in enumerate(poses):
+        frame = corner(T)
+        depth = frame.depth + errors[k] + noise * rng.standard_normal(PATTERN.shape)
+        frame = replace(frame, index=k, depth=depth.astype(np.float32))
+        found.append(SampledView.of(prepare_view(frame, SHARP), 1500))
+    return found
+
+
+def depth_of_planes(view: SampledView) -> np.ndarray:
+    """Where the plane of each pixel meets its ray, NaN without one."""
+    along = (view.target[..., :2] * view.projection.rays).sum(-1) + view.target[..., 2]
+    distance = view.target[..., 3]
+    return np.where(distance != 0, distance / np.where(distance != 0, along, 1), np.nan)
+
+
+def test_pattern_is_found_from_poses_that_followed_it():
+    truth = path(24)
+    seen = views(truth, PATTERN)
+    chain = np.stack([np.arange(23), np.arange(1, 24)], 1)
+    bent = refine(seen, truth, replace(OPTIONS, shared=0.0), pairs=chain).poses
+    found = fixed_pattern.estimate(seen, bent, OPTIONS)
+    assert np.corrcoef(found.z.ravel(), -PATTERN.ravel())[0, 1] > 0.9
+    assert 0.7 < np.sum(found.z * -PATTERN) / np.sum(PATTERN**2) < 1.2
+    as_they_are = refine(seen, bent, OPTIONS).poses
+    without = refine([found.corrected(view) for view in seen], bent, OPTIONS).poses
+    assert away(without, truth) < 0.5 * away(as_they_are, truth)
+
+
+def test_nothing_is_found_where_errors_differ_from_view_to_view():
+    truth = path(24)
+    nothing = fixed_pattern.estimate(views(truth, 0.0), truth, OPTIONS)
+    assert np.abs(nothing.z).max() < 0.0005
+    rng = np.random.default_rng(7)
+    phases = rng.uniform(0, 2 * np.pi, (24, 2, 1, 1))
+    turning = 0.005 * np.cos(ACROSS + phases[:, 0]) * np.cos(DOWN + phases[:, 1])
+    found = fixed_pattern.estimate(views(truth, turning), truth, OPTIONS)
+    assert found.z.std() < 0.2 * turning.std()
+
+
+def test_corrected_view_is_that_of_a_camera_without_errors():
+    (wrong,), (right,) = (views(np.eye(4)[None], e, noise=0.0) for e in (PATTERN, 0.0))
+    pattern = fixed_pattern.FixedPattern((-PATTERN).astype(np.float32))
+    corrected = pattern.corrected(wrong)
+    np.testing.assert_allclose(corrected.points[:, :3], right.points[:, :3], atol=2e-4)
+    depth_right, *depths = (depth_of_planes(view) for view in (right, wrong, corrected))
+    before, after = (np.nanmedian(np.abs(depth - depth_right)) for depth in depths)
+    assert after < 0.1 * before
+    assert fixed_pattern.FixedPattern(None).corrected(wrong) is wrong
+
+
+def test_few_views_say_nothing():
+    truth = path(24)[:7]
+    assert fixed_pattern.estimate(views(truth, PATTERN), truth, OPTIONS).z is None
+    assert fixed_pattern.estimate([], truth[:0], OPTIONS).z is None
+
+
+@pytest.mark.parametrize(("count", "most"), [(301, 300), (5000, 300), (40, 10)])
+def test_runs_of_views_are_spread_over_the_path(count: int, most: int):
+    chosen = fixed_pattern.runs_of_views(count, most)
+    assert chosen[0] == 0
+    assert chosen[-1] == count - 1 or most < 64
+    assert len(chosen) <= max(most, 32)
+    assert np.median(np.diff(chosen)) == 1
