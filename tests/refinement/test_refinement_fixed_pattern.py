@@ -55,13 +55,12 @@ def test_pattern_is_found_from_poses_that_followed_it():
 
 def test_nothing_is_found_where_errors_differ_from_view_to_view():
     truth = path(24)
-    nothing = fixed_pattern.estimate(views(truth, 0.0), truth, OPTIONS)
-    assert np.abs(nothing.z).max() < 0.0005
+    assert fixed_pattern.estimate(views(truth, 0.0), truth, OPTIONS).z is None
     rng = np.random.default_rng(7)
     phases = rng.uniform(0, 2 * np.pi, (24, 2, 1, 1))
     turning = 0.005 * np.cos(ACROSS + phases[:, 0]) * np.cos(DOWN + phases[:, 1])
     found = fixed_pattern.estimate(views(truth, turning), truth, OPTIONS)
-    assert found.z.std() < 0.2 * turning.std()
+    assert found.z is None or found.z.std() < 0.2 * turning.std()
 
 
 def test_corrected_view_is_that_of_a_camera_without_errors():

@@ -41,6 +41,8 @@ _MIN_POINTS, _MIN_VIEWS = 50, SECTIONS
 _POSE_SIGMA = 0.02
 _MAD = 1.4826  # standard deviation over the median absolute deviation of a normal distribution
 _RESCALED = 2  # iterations for exposure and scales of the pairs
+# Logarithm of the factor by which views are likelier with a pattern: strong evidence (Jeffreys).
+_STRONG = float(np.log(10))
 # Iterations for the variance of the coefficients, from this sigma, m.
 _ITERATIONS, _FIRST_SIGMA = 20, 0.002
 
@@ -52,7 +54,7 @@ class FixedPattern:
     Attributes
     ----------
     z
-        (H, W) m, along the ray, with a mean of about 0; None if the views don't tell.
+        (H, W) m, along the ray, with a mean of about 0; None without strong evidence for any.
     """
 
     z: Float32 | None
@@ -106,7 +108,7 @@ def estimate(
     state = pair_equations.DirectedPairs.of(views, pairs, options)
     albedo = _albedo_equations(state, poses)
     modes = _modes(shape)
-    count = len(state.target)
+    count = len(pairs)  # one direction of each is enough
     A, g = np.zeros((count, _MODES, _MODES)), np.zeros((count, _MODES))
 
     def work(a: int, b: int) -> None:
@@ -118,7 +120,9 @@ def estimate(
                 A[k], g[k] = of_pair
 
     run_chunks(work, count, -(-count // _PAIRS_A_CHUNK))
-    coefficients = _coefficients(A, g, state.target)
+    coefficients = _coefficients(A, g, state.target[:count])
+    if coefficients is None:
+        return FixedPattern(None)
     return FixedPattern((modes @ coefficients).astype(np.float32).reshape(shape))
 
 
@@ -194,8 +198,10 @@ def _pattern_equations(
     return B.T @ wB - coupling.T @ eliminated[:, :-1], r @ wB - coupling.T @ eliminated[:, -1]
 
 
-def _coefficients(A: Float64, g: Float64, target: Intp) -> Float64:
+def _coefficients(A: Float64, g: Float64, target: Intp) -> Float64 | None:
     """Return the coefficients (MODES,) by the equations (P, MODES, MODES), (P, MODES) of pairs.
+
+    None without strong evidence for any.
 
     Their variance maximises the likelihood (expectation maximisation). The information is divided
     by the scatter of the scores of sections of the path, by the targets (P,) of the pairs, relative
@@ -212,4 +218,9 @@ def _coefficients(A: Float64, g: Float64, target: Intp) -> Float64:
         np.add.at(scores, section, g + A @ c)
         scatter = float(scores.var(0, ddof=1).sum()) * SECTIONS
         dispersion = max(scatter / float(np.trace(total)), 1.0)
-    return c
+    # Of the pattern against none, with the variance that maximises it.
+    log_ratio = -0.5 * float(
+        c @ gradient / dispersion
+        + np.linalg.slogdet(np.eye(_MODES) + variance * total / dispersion)[1]
+    )
+    return c if log_ratio > _STRONG else None

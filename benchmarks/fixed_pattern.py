@@ -1,0 +1,115 @@
+"""Depth errors that are fixed to the camera: whole runs with and without their estimate.
+
+Recordings of the second simulator (`other_sensor.py`), without indirect light, and with a smooth
+pattern of errors over the image that is added to all depths. Each is reconstructed as by default,
+and without `refinement.fixed_pattern`. A row has the rms of the pattern, and, without and with the
+estimate, the rms error of the poses and the stated bound; at the end, by rms, the median ratio of
+the errors, and how many are within their bound.
+
+    python benchmarks/fixed_pattern.py [--seeds 61] [--cameras azure phone] [--rms 0 2 4]
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from unittest.mock import patch
+
+import cv2
+import numpy as np
+
+import other_sensor
+from tofuse.engine.arrays import Float32
+from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.mapping.reconstructing import reconstruct
+from tofuse.engine.quality.trajectory_errors import displacement
+from tofuse.engine.refinement import fixed_pattern
+
+WIDTH = 0.1  # of the kernel that makes the pattern smooth, as a fraction of the image's width
+
+
+def pattern(shape: tuple[int, int], rms_m: float, rng: np.random.Generator) -> Float32:
+    """Return a smooth random image (H, W), m."""
+    width = WIDTH * shape[1]
+    margin = round(3 * width)
+    noise = rng.standard_normal((shape[0] + 2 * margin, shape[1] + 2 * margin))
+    smooth = cv2.GaussianBlur(noise, (0, 0), width)[margin:-margin, margin:-margin]
+    return (rms_m * smooth / smooth.std()).astype(np.float32)
+
+
+def with_pattern(recording: Recording, errors: Float32) -> Recording:
+    """Return a recording whose depth has these errors, m."""
+    frames = [
+        replace(frame, depth=np.where(frame.valid, frame.depth + errors, 0).astype(np.float32))
+        for frame in recording
+        if isinstance(frame, RangeFrame)
+    ]
+    source = ArraySource(frames, recording.reference, metadata=dict(recording.metadata))
+    return Recording.of(source, recording.path, recording.format)
+
+
+def judged(recording: Recording) -> tuple[float, float]:
+    """Return the rms error of the poses and the stated bound, mm."""
+    result = reconstruct(recording)
+    truth, posed = recording.reference, result.has_pose
+    assert truth is not None
+    error = displacement(truth[posed], result.trajectory[posed])[0] if posed.sum() > 2 else np.inf
+    return 1e3 * error, 1e3 * result.diagnostics.accuracy.position_m
+
+
+def rows(seeds: Sequence[int], cameras: Sequence[str], rms: Sequence[float]) -> Iterator[Row]:
+    """Yield for each recording its name, the rms, and both errors and bounds."""
+    for seed in seeds:
+        for camera in cameras:
+            for scene in other_sensor.SCENES:
+                plain = other_sensor.record(scene, camera, seed, indirect=False)
+                shape = plain[0].depth.shape
+                for size in rms:
+                    errors = pattern(shape, 1e-3 * size, np.random.default_rng(seed))
+                    recording = with_pattern(plain, errors)
+                    nothing = fixed_pattern.FixedPattern(None)
+                    with patch.object(fixed_pattern, "estimate", return_value=nothing):
+                        without = judged(recording)
+                    yield f"{scene}, {camera}, seed {seed}", size, without, judged(recording)
+
+
+Row = tuple[str, float, tuple[float, float], tuple[float, float]]
+
+
+def main() -> None:
+    """Run all, print a row for each and the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    cameras = [*other_sensor.SENSORS]
+    parser.add_argument("--seeds", nargs="*", type=int, default=[61])
+    parser.add_argument("--cameras", nargs="*", default=["azure", "phone"], choices=cameras)
+    parser.add_argument("--rms", nargs="*", type=float, default=[0, 2, 4], help="mm")
+    given = parser.parse_args()
+    print("| recording | pattern, mm | error, mm: without, with | bound, mm |")
+    print("|---" * 4 + "|")
+    found = []
+    for row in rows(given.seeds, given.cameras, given.rms):
+        name, size, without, estimated = row
+        found.append(row)
+        print(
+            f"| {name} | {size:g} | {without[0]:.1f}, {estimated[0]:.1f} "
+            f"| {without[1]:.1f}, {estimated[1]:.1f} |",
+            flush=True,
+        )
+    print("\n| pattern, mm | runs | error with / without | better | within the bound |")
+    print("|---" * 5 + "|")
+    for size in given.rms:
+        own = [row for row in found if row[1] == size]
+        ratios = np.array([estimated[0] / without[0] for _, _, without, estimated in own])
+        inside = [sum(run[k][0] <= run[k][1] for run in own) for k in (2, 3)]
+        print(
+            f"| {size:g} | {len(own)} | {np.median(ratios):.2f} | {(ratios < 1).sum()} "
+            f"| {inside[0]}, {inside[1]} |"
+        )
+
+
+if __name__ == "__main__":
+    main()
