@@ -20,6 +20,7 @@ from tofuse.engine.mapping.tracked_graph import Optimised, Refined, TrackedGraph
 from tofuse.engine.parts import name_of
 from tofuse.engine.quality import (
     ambiguous_frames,
+    ambiguous_places,
     background,
     cross_view_agreement,
     pose_accuracy,
@@ -375,7 +376,9 @@ class Assessment:
         # A camera that seems to stand still has one stored view; it may move on by a period.
         if newest is not None and newest.index in poses.keys() - {view.index for view in views}:
             views = [*views, newest]
-        return ambiguous_frames(views, poses, moments)
+        return tuple(
+            sorted({*ambiguous_frames(views, poses, moments), *ambiguous_places(views, poses)})
+        )
 
     def _checked_views(
         self, graph: PoseGraph, *, with_open: bool = False

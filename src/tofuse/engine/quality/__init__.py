@@ -3,7 +3,8 @@
 `pose_accuracy` bounds the errors of poses by their covariance. `cross_view_agreement` and
 `map_agreement` compare overlapping images at given poses, `pose_deviation` the poses with
 registrations, `trajectory_errors` with a reference; `pose_causes` names what is wrong with them.
-`changes` tells what moved between two recordings; `ambiguous_frames` where a scene repeats itself.
+`changes` tells what moved between two recordings; `ambiguous_frames` and `ambiguous_places` where a
+scene repeats itself.
 """
 
 from typing import TYPE_CHECKING
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
         trajectory_errors,
     )
     from tofuse.engine.quality.change_detection import Change, changes
+    from tofuse.engine.quality.rival_places import ambiguous_places
     from tofuse.engine.quality.rival_steps import ambiguous_frames
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

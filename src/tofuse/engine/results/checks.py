@@ -119,7 +119,7 @@ class Evidence:
     single_link_frames
         Indices of the frames that a single registration connects to the first one.
     ambiguous
-        Indices of examined frames to which another step fits as well.
+        Indices of examined frames that another step, or another place, fits as well.
     """
 
     records: tuple[FrameRecord, ...]
@@ -311,8 +311,8 @@ def _motion(e: Evidence) -> Iterator[Reason]:
     if ambiguous := e.runs_of(e.ambiguous):
         text = (
             f"Around {frame_ranges.in_words(ambiguous)} the scene repeats itself: another step "
-            "between two frames fits as well as the tracked one, so no bound on the pose errors is "
-            "stated."
+            "between two frames, or another place of views that were joined, fits as well, so no "
+            "bound on the pose errors is stated."
         )
         yield Reason("ambiguous_steps", ambiguous, text)
     repeated = e.runs_of(e.repeated)

@@ -46,7 +46,7 @@ REASONS: dict[str, tuple[str, str]] = {
     "open_motion": ("degraded", "So much of the view moves that what stands still is open."),
     "ambiguous_steps": (
         "degraded",
-        "The scene repeats itself: other steps between frames fit as well.",
+        "The scene repeats itself: other steps between frames, or other places, fit as well.",
     ),
     "moving_objects": ("note", "Objects move in front of the camera; they are excluded."),
     "unstable_depth": ("note", "Depth varies from view to view; it is excluded there."),
