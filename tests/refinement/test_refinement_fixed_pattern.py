@@ -9,6 +9,7 @@ import pytest
 
 from aligned_surfaces import OPTIONS, away, path
 from corner_views import CAMERA, SHARP, corner
+from tofuse.engine.geometry import se3
 from tofuse.engine.refinement import fixed_pattern
 from tofuse.engine.refinement.joint_alignment import refine
 from tofuse.engine.stored_views.view_store import SampledView
@@ -74,7 +75,9 @@ def test_corrected_view_is_that_of_a_camera_without_errors():
     assert fixed_pattern.FixedPattern(None).corrected(wrong) is wrong
 
 
-def test_few_views_say_nothing():
+def test_few_views_and_views_apart_say_nothing():
+    apart = se3.exp(np.outer(np.arange(8), [100.0, 0, 0, 0, 0, 0]))
+    assert fixed_pattern.estimate(views(path(8), PATTERN), apart, OPTIONS).z is None
     truth = path(24)[:7]
     assert fixed_pattern.estimate(views(truth, PATTERN), truth, OPTIONS).z is None
     assert fixed_pattern.estimate([], truth[:0], OPTIONS).z is None

@@ -208,6 +208,8 @@ def _coefficients(A: Float64, g: Float64, target: Intp) -> Float64 | None:
     to that by noise alone: within a section, views share the errors of the scene.
     """
     total, gradient = A.sum(0), g.sum(0)
+    if not total.any():  # no views overlap
+        return None
     section = target * SECTIONS // (int(target.max()) + 1)
     c, variance, dispersion = np.zeros(_MODES), _FIRST_SIGMA**2, 1.0
     for _ in range(_ITERATIONS):
