@@ -102,8 +102,8 @@ def estimate(
     shape = views[0].target.shape[:2] if views else (0, 0)
     if len(views) < _MIN_VIEWS or any(view.target.shape[:2] != shape for view in views):
         return FixedPattern(None)
-    pairs = np.array([(k, k + lag) for k in range(len(views)) for lag in _LAGS], np.intp)
-    pairs = pairs[pairs[:, 1] < len(views)]
+    # By lag, so that every n-th pair has all of them.
+    pairs = np.array([(k, k + lag) for lag in _LAGS for k in range(len(views) - lag)], np.intp)
     pairs = pairs[:: -(-len(pairs) // _MAX_PAIRS)]
     state = pair_equations.DirectedPairs.of(views, pairs, options)
     albedo = _albedo_equations(state, poses)
