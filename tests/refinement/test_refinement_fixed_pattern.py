@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from aligned_surfaces import OPTIONS, away, path
 from corner_views import CAMERA, SHARP, corner
@@ -81,12 +80,3 @@ def test_few_views_and_views_apart_say_nothing():
     truth = path(24)[:7]
     assert fixed_pattern.estimate(views(truth, PATTERN), truth, OPTIONS).z is None
     assert fixed_pattern.estimate([], truth[:0], OPTIONS).z is None
-
-
-@pytest.mark.parametrize(("count", "most"), [(301, 300), (5000, 300), (40, 10)])
-def test_runs_of_views_are_spread_over_the_path(count: int, most: int):
-    chosen = fixed_pattern.runs_of_views(count, most)
-    assert chosen[0] == 0
-    assert chosen[-1] == count - 1 or most < 64
-    assert len(chosen) <= max(most, 32)
-    assert np.median(np.diff(chosen)) == 1

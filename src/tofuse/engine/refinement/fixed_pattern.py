@@ -79,14 +79,6 @@ def _pixels(view: SampledView) -> Intp:
     return (v.clip(0, rows - 1) * columns + u.clip(0, columns - 1)).astype(np.intp)
 
 
-def runs_of_views(count: int, most: int) -> list[int]:
-    """Return the positions of up to `most` of many views, in runs that a path spreads evenly."""
-    length = _LAGS[-1] * 4
-    runs = max(most // length, 1)
-    starts = np.linspace(0, max(count - length, 0), runs).astype(int)
-    return np.unique((starts[:, None] + np.arange(length)).clip(max=count - 1)).tolist()
-
-
 def estimate(
     views: Sequence[SampledView], poses: Float64, options: pair_equations.RefineOptions
 ) -> FixedPattern:

@@ -278,34 +278,30 @@ class _Joint(Refiner):
         priors = _priors([p.index for p in posed], sensors)
         alignment = self._options.alignment
         pattern = fixed_pattern.estimate(views, poses, alignment)
-        for k, view in enumerate(views):
-            views[k] = pattern.corrected(view)
-        refined = refine(views, poses, alignment, calibrate=self._error_indices, priors=priors)
+        corrected = [pattern.corrected(view) for view in views]
+        refined = refine(corrected, poses, alignment, calibrate=self._error_indices, priors=priors)
+        # The pattern would take the effects of a wrong calibration.
         aligned = RefinedViews(views, refined, alignment, priors, self._error_indices)
-        return refined, [self._evaluate(aligned)]
+        return refined, [self._evaluate(aligned, replace(aligned, views=corrected))]
 
     def _in_submaps(
         self, posed: _Views, poses: Float64, sensors: external_sensors.SensorPriors
     ) -> tuple[Refined, list[_Evaluation]]:
         ids = [p.index for p in posed]
-        some = fixed_pattern.runs_of_views(len(posed), self._options.submap)
-        sampled = [self._sampled(posed[k]) for k in some]
-        pattern = fixed_pattern.estimate(sampled, poses[some], self._options.alignment)
-        del sampled
         return refine_submaps(
             [self._coarse(p) for p in posed],
             poses,
             self._options.alignment,
             self._options.submap,
-            lambda subset: [pattern.corrected(self._sampled(posed[k])) for k in subset],
+            lambda subset: [self._sampled(posed[k]) for k in subset],
             lambda subset: _priors(ids if subset is None else [ids[k] for k in subset], sensors),
             self._evaluate,
             self._error_indices,
         )
 
-    def _evaluate(self, submap: RefinedViews) -> _Evaluation:
-        """Evaluate a submap while its views are in memory."""
-        split = split_half_errors(submap)
+    def _evaluate(self, submap: RefinedViews, corrected: RefinedViews | None = None) -> _Evaluation:
+        """Evaluate a submap while its views are in memory, and without the fixed pattern."""
+        split = split_half_errors(submap if corrected is None else corrected)
         if not self._error_indices:
             return check_calibration(submap), split
         gap = loop_gap(submap, submap.refined.poses, submap.refined.errors)
