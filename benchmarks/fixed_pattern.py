@@ -27,6 +27,7 @@ from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.refinement import fixed_pattern
 
+Row = tuple[str, float, tuple[float, float], tuple[float, float]]
 WIDTH = 0.1  # of the kernel that makes the pattern smooth, as a fraction of the image's width
 
 
@@ -73,9 +74,6 @@ def rows(seeds: Sequence[int], cameras: Sequence[str], rms: Sequence[float]) -> 
                     with patch.object(fixed_pattern, "estimate", return_value=nothing):
                         without = judged(recording)
                     yield f"{scene}, {camera}, seed {seed}", size, without, judged(recording)
-
-
-Row = tuple[str, float, tuple[float, float], tuple[float, float]]
 
 
 def main() -> None:

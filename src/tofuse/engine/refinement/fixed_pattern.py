@@ -24,11 +24,12 @@ from tofuse.engine.arrays import Float32, Float64, Intp
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.geometry import se3
+from tofuse.engine.normal import robust_sigma
 from tofuse.engine.refinement.camera_response import SECTIONS
 from tofuse.engine.stored_views import SampledView, pair_equation_kernels, pair_equations
 from tofuse.engine.views import residual_kernels
 
-# Half periods of the cosines across and down. Their mean is the range offset of the camera.
+# Half periods of the cosines across and down; without the constant, the range offset of the camera.
 _ACROSS, _DOWN = 5, 4
 _ORDERS = np.array([(a, b) for a in range(_ACROSS) for b in range(_DOWN) if a or b])
 _MODES = len(_ORDERS)
@@ -39,7 +40,6 @@ _PAIRS_A_CHUNK = 8
 _MIN_POINTS, _MIN_VIEWS = 50, SECTIONS
 # Prior sigma of the relative pose of a pair, m and rad.
 _POSE_SIGMA = 0.02
-_MAD = 1.4826  # standard deviation over the median absolute deviation of a normal distribution
 _RESCALED = 2  # iterations for exposure and scales of the pairs
 # Logarithm of the factor by which views are likelier with a pattern: strong evidence (Jeffreys).
 _STRONG = float(np.log(10))
@@ -177,7 +177,7 @@ def _pattern_equations(
         return None
     p, q, n, m = p[used], q[used], n[used], m[used]
     r = (n * q).sum(1) - distance[used]
-    sigma = max(_MAD * float(np.median(np.abs(r))), 1e-6)
+    sigma = max(robust_sigma(r), 1e-6)
     weight = tukey.weights((r / (projective.ROBUST * sigma)) ** 2) / sigma**2
     J = np.concatenate([m, np.cross(p, m)], axis=1)
     B = modes[_pixels(source)[used]] * ((m * p).sum(1) / p[:, 2])[:, None]
