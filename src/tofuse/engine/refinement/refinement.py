@@ -278,11 +278,16 @@ class _Joint(Refiner):
         priors = _priors([p.index for p in posed], sensors)
         alignment = self._options.alignment
         pattern = fixed_pattern.estimate(views, poses, alignment)
-        corrected = [pattern.corrected(view) for view in views]
-        refined = refine(corrected, poses, alignment, calibrate=self._error_indices, priors=priors)
-        # The pattern would take the effects of a wrong calibration.
+        # In place: all views twice would be the most memory of a run.
+        for k, view in enumerate(views):
+            views[k] = pattern.corrected(view)
+        refined = refine(views, poses, alignment, calibrate=self._error_indices, priors=priors)
         aligned = RefinedViews(views, refined, alignment, priors, self._error_indices)
-        return refined, [self._evaluate(aligned, replace(aligned, views=corrected))]
+        split = split_half_errors(aligned)
+        # The pattern would take the effects of a wrong calibration.
+        for k in range(len(views) if pattern.z is not None else 0):
+            views[k] = self._sampled(posed[k])
+        return refined, [(self._check(aligned), split)]
 
     def _in_submaps(
         self, posed: _Views, poses: Float64, sensors: external_sensors.SensorPriors
@@ -299,13 +304,15 @@ class _Joint(Refiner):
             self._error_indices,
         )
 
-    def _evaluate(self, submap: RefinedViews, corrected: RefinedViews | None = None) -> _Evaluation:
-        """Evaluate a submap while its views are in memory, and without the fixed pattern."""
-        split = split_half_errors(submap if corrected is None else corrected)
+    def _evaluate(self, submap: RefinedViews) -> _Evaluation:
+        """Evaluate a submap while its views are in memory."""
+        return self._check(submap), split_half_errors(submap)
+
+    def _check(self, aligned: RefinedViews) -> CalibrationCheck:
         if not self._error_indices:
-            return check_calibration(submap), split
-        gap = loop_gap(submap, submap.refined.poses, submap.refined.errors)
-        return CalibrationCheck(gap=gap), split
+            return check_calibration(aligned)
+        gap = loop_gap(aligned, aligned.refined.poses, aligned.refined.errors)
+        return CalibrationCheck(gap=gap)
 
     def _coarse(self, posed: PosedView[PreparedView]) -> SpilledCoarseView:
         surface = _surface(posed)
