@@ -18,9 +18,11 @@ V, U = np.indices((CAMERA.height, CAMERA.width)) + 0.5
 ACROSS, DOWN = np.pi * U / CAMERA.width, np.pi * V / CAMERA.height
 PATTERN = 0.004 * np.cos(2 * ACROSS) * np.cos(DOWN) - 0.003 * np.cos(3 * ACROSS)
 """Errors of the depth, m."""
+NOISE = 0.002
+"""Noise of the depth, m."""
 
 
-def views(poses, errors, noise: float = 0.002) -> list[SampledView]:
+def views(poses, errors, noise: float = NOISE) -> list[SampledView]:
     """Views of the corner with depth errors, one image for all or one for each."""
     rng = np.random.default_rng(3)
     errors = np.broadcast_to(errors, (len(poses), *PATTERN.shape))
@@ -53,9 +55,40 @@ def test_pattern_is_found_from_poses_that_followed_it():
     assert away(without, truth) < 0.5 * away(as_they_are, truth)
 
 
+def test_large_errors_are_not_taken_for_outliers():
+    """Where the surfaces of most pixels move little, errors of the rest exceed the scatter."""
+    truth = path(24)
+    large = 4 * np.where(np.cos(ACROSS) > 0.5, PATTERN, 0.2 * PATTERN)
+    found = fixed_pattern.estimate(views(truth, large), truth, OPTIONS)
+    assert np.sum(found.z * -large) / np.sum(large**2) > 0.6
+
+
+def test_errors_in_the_disparity_grow_with_the_square_of_the_depth():
+    truth, depth = path(24), 3.0
+    squared = [PATTERN * (corner(T).depth / depth) ** 2 for T in truth]
+    found = fixed_pattern.estimate(views(truth, squared), truth, OPTIONS)
+    assert found.power == 2
+    as_seen = found.z * (depth / found.depth) ** 2
+    assert np.corrcoef(as_seen.ravel(), -PATTERN.ravel())[0, 1] > 0.9
+    assert fixed_pattern.estimate(views(truth, PATTERN), truth, OPTIONS).power == 0
+
+
+def test_runs_of_many_views_suffice():
+    positions = fixed_pattern.runs(1000)
+    assert len(positions) == 8 * 16
+    assert (positions[0], positions[-1]) == (0, 999)
+    assert list(fixed_pattern.runs(5)) == [0, 1, 2, 3, 4]
+    truth = path(48)
+    kept = np.concatenate([np.arange(12), np.arange(36, 48)])
+    seen = [view for k, view in enumerate(views(truth, PATTERN)) if k in kept]
+    found = fixed_pattern.estimate(seen, truth[kept], OPTIONS, kept)
+    assert np.corrcoef(found.z.ravel(), -PATTERN.ravel())[0, 1] > 0.9
+
+
 def test_nothing_is_found_where_errors_differ_from_view_to_view():
     truth = path(24)
-    assert fixed_pattern.estimate(views(truth, 0.0), truth, OPTIONS).z is None
+    nothing = fixed_pattern.estimate(views(truth, 0.0), truth, OPTIONS)
+    assert nothing.z is None or nothing.z.std() < 0.05 * NOISE
     rng = np.random.default_rng(7)
     phases = rng.uniform(0, 2 * np.pi, (24, 2, 1, 1))
     turning = 0.005 * np.cos(ACROSS + phases[:, 0]) * np.cos(DOWN + phases[:, 1])

@@ -20,27 +20,40 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tofuse.engine.alignment import projective
-from tofuse.engine.arrays import Float32, Float64, Intp
-from tofuse.engine.compute import run_chunks
+from tofuse.engine.arrays import Bool, Float32, Float64, Intp
+from tofuse.engine.compute import one_blas_thread, run_chunks
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import robust_sigma
+from tofuse.engine.refinement.calibration_check import USUAL
 from tofuse.engine.refinement.camera_response import SECTIONS
-from tofuse.engine.stored_views import SampledView, pair_equation_kernels, pair_equations
+from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.views import residual_kernels
 
 # Half periods of the cosines across and down; without the constant, the range offset of the camera.
-_ACROSS, _DOWN = 5, 4
+_ACROSS, _DOWN = 7, 6
 _ORDERS = np.array([(a, b) for a in range(_ACROSS) for b in range(_DOWN) if a or b])
 _MODES = len(_ORDERS)
+# Errors of the calibration, which are estimated as well: focal length, principal point (two),
+# distortion and range offset, as in `calibration_check`.
+_ERRORS = 5
+_UNKNOWNS = _MODES + _ERRORS
+# The errors of time of flight are the same at each depth, those of triangulation, in the disparity,
+# grow with its square: powers that are tried.
+_POWERS = 0.0, 2.0
 # Views are compared with the ones this many later, and at most so many pairs in all.
 _LAGS, _MAX_PAIRS = (1, 2, 4, 8), 200
 _PAIRS_A_CHUNK = 8
+_RUN = 16  # views of a run, where there are too many views for all to be in memory
 # Minimum number of points of a pair, and of views: one for each section of the path.
 _MIN_POINTS, _MIN_VIEWS = 50, SECTIONS
+# Added to the sigma of the residuals, m: at first they contain the pattern, and its largest errors
+# would be outliers.
+_INFLATIONS = 0.02, 0.005, 0.0
 # Prior sigma of the relative pose of a pair, m and rad.
 _POSE_SIGMA = 0.02
-_RESCALED = 2  # iterations for exposure and scales of the pairs
+# Prior information of the pose and of the exposure, a log albedo.
+_PRIOR = np.array([1 / _POSE_SIGMA**2] * 6 + [1.0])
 # Logarithm of the factor by which views are likelier with a pattern: strong evidence (Jeffreys).
 _STRONG = float(np.log(10))
 # Iterations for the variance of the coefficients, from this sigma, m.
@@ -54,21 +67,72 @@ class FixedPattern:
     Attributes
     ----------
     z
-        (H, W) m, along the ray, with a mean of about 0; None without strong evidence for any.
+        (H, W) m, along the ray, at `depth`, with a mean of about 0; None without strong evidence
+        for any.
+    depth
+        m.
+    power
+        Of the depth, to which the errors are proportional.
     """
 
     z: Float32 | None
+    depth: float = 1.0
+    power: float = 0.0
 
     def corrected(self, view: SampledView) -> SampledView:
         """Return a view without these errors: its points, and the planes of its target image."""
         if self.z is None:
             return view
         points, target = view.points.copy(), view.target.copy()
-        points[:, :3] *= (1 + self.z.ravel()[_pixels(view)] / points[:, 2])[:, None]
-        shift = (target[..., :2] * view.projection.rays).sum(-1) + target[..., 2]
+        z = points[:, 2]
+        points[:, :3] *= (1 + self._at(z, self.z.ravel()[_pixels(view)]) / z)[:, None]
+        along = (target[..., :2] * view.projection.rays).sum(-1) + target[..., 2]
         distance = target[..., residual_kernels.DISTANCE]
-        distance += np.where(distance != 0, shift * self.z / np.float32(view.target_scale), 0)
+        # Of pixels without a plane, both are 0.
+        scale = np.float32(view.target_scale)
+        of_planes = np.divide(distance * scale, along, out=np.zeros_like(along), where=along != 0)
+        distance += np.where(distance != 0, along * self._at(of_planes, self.z) / scale, 0)
         return replace(view, points=points, target=target)
+
+    def _at(self, z: Float32, pattern: Float32) -> Float32:
+        """Return the pattern, of some pixels, at their depths z, m."""
+        return np.asarray(pattern * (z / np.float32(self.depth)) ** np.float32(self.power))
+
+
+@dataclass(frozen=True, eq=False)
+class _Modes:
+    """Cosines over the image.
+
+    Attributes
+    ----------
+    values
+        (H W, MODES).
+    depth, power
+        As of `FixedPattern`.
+    """
+
+    values: Float64
+    depth: float
+    power: float
+
+    @classmethod
+    def of(cls, shape: tuple[int, ...], depth: float, power: float) -> _Modes:
+        """Return those of an image (H, W)."""
+        v, u = np.indices(shape).reshape(2, -1)
+        phase = np.pi * (np.stack([u, v], 1) + 0.5) / shape[::-1]
+        values = np.prod(np.cos(phase[:, None] * _ORDERS), axis=2)
+        return cls(np.asarray(values, np.float64), depth, power)
+
+    def at(self, pixels: Intp, z: Float64) -> Float64:
+        """Return the (N, MODES) changes of the depth of points at pixels (N,) and depths (N,)."""
+        return np.asarray(
+            self.values[pixels] * ((z / self.depth) ** self.power)[:, None], np.float64
+        )
+
+    def pattern(self, coefficients: Float64, shape: tuple[int, ...]) -> FixedPattern:
+        """Return the sum of the modes."""
+        z = (self.values @ coefficients).astype(np.float32).reshape(shape)
+        return FixedPattern(z, self.depth, self.power)
 
 
 def _pixels(view: SampledView) -> Intp:
@@ -79,8 +143,18 @@ def _pixels(view: SampledView) -> Intp:
     return (v.clip(0, rows - 1) * columns + u.clip(0, columns - 1)).astype(np.intp)
 
 
+def runs(count: int) -> Intp:
+    """Return the positions of some of `count` views: evenly spaced runs of successive ones."""
+    starts = np.linspace(0, max(count - _RUN, 0), SECTIONS).astype(np.intp)
+    return np.unique((starts[:, None] + np.arange(min(_RUN, count))).ravel())
+
+
+@one_blas_thread()
 def estimate(
-    views: Sequence[SampledView], poses: Float64, options: pair_equations.RefineOptions
+    views: Sequence[SampledView],
+    poses: Float64,
+    options: pair_equations.RefineOptions,
+    positions: Intp | None = None,
 ) -> FixedPattern:
     """Estimate the pattern from some pairs of views.
 
@@ -90,131 +164,249 @@ def estimate(
         N views of one camera, in order, and their (N, 4, 4) T_world_camera.
     options
         Of the refinement.
+    positions
+        (N,) ascending positions of the views among all; by default, these are all.
     """
     shape = views[0].target.shape[:2] if views else (0, 0)
     if len(views) < _MIN_VIEWS or any(view.target.shape[:2] != shape for view in views):
         return FixedPattern(None)
-    # By lag, so that every n-th pair has all of them.
-    pairs = np.array([(k, k + lag) for lag in _LAGS for k in range(len(views) - lag)], np.intp)
-    pairs = pairs[:: -(-len(pairs) // _MAX_PAIRS)]
-    state = pair_equations.DirectedPairs.of(views, pairs, options)
-    albedo = _albedo_equations(state, poses)
-    modes = _modes(shape)
-    count = len(pairs)  # one direction of each is enough
-    A, g = np.zeros((count, _MODES, _MODES)), np.zeros((count, _MODES))
-
-    def work(a: int, b: int) -> None:
-        for k in range(a, b):
-            t, s = state.target[k], state.source[k]
-            T = se3.inverse(poses[t]) @ poses[s]
-            of_pair = _pattern_equations(views[s], views[t], T, modes, albedo[0][k], albedo[1][k])
-            if of_pair is not None:
-                A[k], g[k] = of_pair
-
-    run_chunks(work, count, -(-count // _PAIRS_A_CHUNK))
-    coefficients = _coefficients(A, g, state.target[:count])
-    if coefficients is None:
-        return FixedPattern(None)
-    return FixedPattern((modes @ coefficients).astype(np.float32).reshape(shape))
+    pairs = _pairs(np.arange(len(views)) if positions is None else positions)
+    depth = float(np.median([view.depth for view in views]))
+    found: list[tuple[float, FixedPattern]] = [(_STRONG, FixedPattern(None))]
+    for power in _POWERS:
+        modes = _Modes.of(shape, depth, power)
+        compared = _compared(views, pairs, poses, modes, photometric=options.photometric)
+        if compared:
+            fit = _Fit(np.zeros(_UNKNOWNS), 0.0)
+            for inflation in _INFLATIONS:
+                fit = _fitted(compared, fit.coefficients, inflation)
+            found.append((fit.log_ratio, modes.pattern(fit.coefficients[:_MODES], shape)))
+    return max(found, key=lambda item: item[0])[1]
 
 
-def _modes(shape: tuple[int, ...]) -> Float64:
-    """Return the cosines (H W, MODES) of an image (H, W)."""
-    v, u = np.indices(shape).reshape(2, -1)
-    phase = np.pi * (np.stack([u, v], 1) + 0.5) / shape[::-1]
-    return np.asarray(np.prod(np.cos(phase[:, None] * _ORDERS), axis=2), np.float64)
+def _pairs(positions: Intp) -> Intp:
+    """Return (P, 2) of the views at these positions: by lag, so that every n-th has all of them."""
+    found = []
+    for lag in _LAGS:
+        later = np.searchsorted(positions, positions + lag)
+        earlier = np.flatnonzero(positions[later % len(positions)] == positions + lag)
+        found.append(np.stack([earlier, later[earlier]], 1))
+    pairs = np.concatenate(found)
+    return pairs[:: -(-len(pairs) // _MAX_PAIRS)]
 
 
-def _albedo_equations(
-    state: pair_equations.DirectedPairs, poses: Float64
-) -> tuple[Float64, Float64]:
-    """Return the normal equations (P, 6, 6), (P, 6) of pairs by their albedo alone.
+@dataclass(frozen=True, eq=False)
+class _Residuals:
+    """Distances of points from the planes of another view, m, or differences of the log albedo.
 
-    In units in which those by their distances have a trace of 1.
+    Attributes
+    ----------
+    residuals
+        (N,).
+    by_pose
+        (N, 7) their Jacobian by the right perturbation of T_target_source and the exposure.
+    by_camera
+        (N, UNKNOWNS) that by the coefficients and the errors of the calibration.
     """
-    fixed = np.zeros(pair_equation_kernels.ERRORS), np.ones(pair_equation_kernels.ERRORS, np.int64)
-    last = state.options.rounds[-1]
 
-    def equations() -> tuple[Float64, Float64]:
-        state.evaluate(poses, *fixed, last)
-        return state.without_exposure()
+    residuals: Float64
+    by_pose: Float64
+    by_camera: Float64
 
-    for _ in range(_RESCALED):
-        equations()
-        state.rescale(last)
-    H, g = equations()
-    state.scale_p[:] = 0
-    H_distance, g_distance = equations()
-    trace = np.maximum(np.trace(H_distance, axis1=1, axis2=2), 1e-12)[:, None]
-    return (H - H_distance) / trace[..., None], (g - g_distance) / trace
+    def left(self, coefficients: Float64) -> Float64:
+        """Return the residuals that coefficients and errors leave."""
+        return np.asarray(self.residuals + self.by_camera @ coefficients, np.float64)
 
 
-def _pattern_equations(
+def _weights(residuals: Float64, inflation: float) -> Float64:
+    """Return robust weights (N, 1) of residuals (N,)."""
+    sigma = max(robust_sigma(residuals), 1e-6)
+    cutoff = projective.ROBUST * np.hypot(sigma, inflation)
+    return np.asarray(tukey.weights((residuals / cutoff) ** 2)[:, None] / sigma**2, np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """A pair of views.
+
+    Attributes
+    ----------
+    target
+        Position of the view that the points are compared with.
+    terms
+        Distances, and albedo if both views have it.
+    """
+
+    target: int
+    terms: tuple[_Residuals, ...]
+
+    def equations(self, coefficients: Float64, inflation: float) -> tuple[Float64, Float64]:
+        """Return the normal equations of the coefficients and errors, without the pose.
+
+        With robust weights of the residuals that these leave, at the best pose.
+        """
+        step = self._best_step(coefficients)
+        H, g = np.diag(np.append(_PRIOR, np.zeros(_UNKNOWNS))), np.zeros(7 + _UNKNOWNS)
+        for term in self.terms:
+            left = term.left(coefficients) + term.by_pose @ step
+            J = np.column_stack([term.by_pose, term.by_camera])
+            wJ = _weights(left, inflation) * J
+            H += J.T @ wJ
+            g += term.residuals @ wJ
+        coupling = H[:7, 7:]
+        eliminated = np.linalg.solve(H[:7, :7], np.column_stack([coupling, g[:7]]))
+        without = coupling.T @ eliminated
+        return H[7:, 7:] - without[:, :-1], g[7:] - without[:, -1]
+
+    def _best_step(self, coefficients: Float64) -> Float64:
+        """Return the step (7,) of the pose and the exposure, without outliers by far."""
+        H, g = np.diag(_PRIOR), np.zeros(7)
+        for term in self.terms:
+            left = term.left(coefficients)
+            wJ = _weights(left, _INFLATIONS[0]) * term.by_pose
+            H += term.by_pose.T @ wJ
+            g += left @ wJ
+        return np.asarray(-np.linalg.solve(H, g), np.float64)
+
+
+def _compared(
+    views: Sequence[SampledView], pairs: Intp, poses: Float64, modes: _Modes, *, photometric: bool
+) -> list[_Compared]:
+    """Compare pairs (P, 2) of views, without those that are apart."""
+    pixels = [_pixels(view) for view in views]
+
+    def work(a: int, b: int) -> list[_Compared]:
+        result = []
+        for k in range(a, b):
+            t, s = pairs[k].tolist()
+            T = se3.inverse(poses[t]) @ poses[s]
+            terms = _terms(views[s], pixels[s], views[t], T, modes, photometric=photometric)
+            if terms:
+                result.append(_Compared(t, terms))
+        return result
+
+    chunks = run_chunks(work, len(pairs), -(-len(pairs) // _PAIRS_A_CHUNK))
+    return [pair for chunk in chunks for pair in chunk]
+
+
+def _terms(
     source: SampledView,
+    pixels: Intp,
     target: SampledView,
     T: Float64,
-    modes: Float64,
-    H_albedo: Float64,
-    g_albedo: Float64,
-) -> tuple[Float64, Float64] | None:
-    """Return the normal equations of the coefficients by a pair, without its pose; None if apart.
+    modes: _Modes,
+    *,
+    photometric: bool,
+) -> tuple[_Residuals, ...]:
+    """Compare a source's points, which are at these pixels, with the target.
 
-    T is (4, 4) T_target_source. A change of the depth moves a point along its ray, and the plane
-    that it is compared with along that of the target.
+    T is (4, 4) T_target_source. Empty if few points see surfaces of the target. A change of the
+    depth moves a point along its ray, and the plane along that of the target; the albedo of the
+    target depends on the ray alone.
     """
-    rows, columns = target.target.shape[:2]
-    p = source.points[:, :3].astype(np.float64)
-    q = se3.transform(T, p)
+    k, (rows, columns) = residual_kernels, target.target.shape[:2]
+    points = source.points.astype(np.float64)
+    q = se3.transform(T, points[:, :3])
     u, v = np.rint(target.projection.pixels(q[:, :2] / np.maximum(q[:, 2:], 1e-3))).T
     inside = (q[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
     pixel = np.where(inside, v * columns + u, 0).astype(np.intp)
-    plane = target.target.reshape(-1, residual_kernels.PIXEL_SIZE)[pixel].astype(np.float64)
-    n, distance = plane[:, :3], plane[:, residual_kernels.DISTANCE] * target.target_scale
-    m = n @ T[:3, :3]
-    normal = source.points[:, residual_kernels.NORMAL : residual_kernels.NORMAL + 3]
-    used = inside & (distance != 0) & ((m * normal).sum(1) > projective.MIN_COSINE)
-    if np.count_nonzero(used) < _MIN_POINTS:
-        return None
-    p, q, n, m = p[used], q[used], n[used], m[used]
-    r = (n * q).sum(1) - distance[used]
-    sigma = max(robust_sigma(r), 1e-6)
-    weight = tukey.weights((r / (projective.ROBUST * sigma)) ** 2) / sigma**2
-    J = np.concatenate([m, np.cross(p, m)], axis=1)
-    B = modes[_pixels(source)[used]] * ((m * p).sum(1) / p[:, 2])[:, None]
-    B -= modes[pixel[used]] * ((n * q).sum(1) / q[:, 2])[:, None]
-    wJ, wB = weight[:, None] * J, weight[:, None] * B
-    H, g, coupling = J.T @ wJ, r @ wJ, wJ.T @ B
-    trace = np.trace(H)
-    H += trace * H_albedo + np.eye(6) / _POSE_SIGMA**2
-    eliminated = np.linalg.solve(H, np.column_stack([coupling, g + trace * g_albedo]))
-    return B.T @ wB - coupling.T @ eliminated[:, :-1], r @ wB - coupling.T @ eliminated[:, -1]
+    image = target.target.reshape(-1, k.PIXEL_SIZE)[pixel].astype(np.float64)
+    n, distance = image[:, :3], image[:, k.DISTANCE] * target.target_scale
+    m, normal = n @ T[:3, :3], points[:, k.NORMAL : k.NORMAL + 3]
+    seen = inside & (distance != 0) & ((m * normal).sum(1) > projective.MIN_COSINE)
+    if np.count_nonzero(seen) < _MIN_POINTS:
+        return ()
+
+    def term(which: Bool, r: Float64, n: Float64, exposure: float) -> _Residuals:
+        p, m = points[which, :3], n[which] @ T[:3, :3]
+        by_pose = np.column_stack([m, np.cross(p, m), np.full(len(p), exposure)])
+        by_camera = _by_camera(m, p, modes.at(pixels[which], p[:, 2]), radial=source.measures_range)
+        of_target = _by_camera(
+            n[which],
+            q[which],
+            modes.at(pixel[which], q[which, 2]),
+            radial=target.measures_range,
+        )
+        if exposure:  # the albedo of the target depends on the ray alone
+            of_target[:, :_MODES] = of_target[:, -1] = 0.0
+        return _Residuals(r[which], by_pose, by_camera - of_target)
+
+    distances = term(seen, (n * q).sum(1) - distance, n, 0.0)
+    if not (photometric and source.has_albedo and target.has_albedo):
+        return (distances,)
+    z = np.where(seen, q[:, 2], 1.0)
+    slope, ray = image[:, k.ALBEDO_SLOPE : k.ALBEDO_SLOPE + 2], q[:, :2] / z[:, None]
+    along = (slope * ray).sum(1)
+    difference = image[:, k.ALBEDO] + along - points[:, k.POINT_ALBEDO]
+    known = seen & np.isfinite(difference)
+    if np.count_nonzero(known) < _MIN_POINTS:
+        return (distances,)
+    gradient = np.column_stack([slope, -along]) / z[:, None]
+    gradient += points[:, k.POINT_ALBEDO_SLOPE : k.POINT_ALBEDO_SLOPE + 3] @ T[:3, :3].T
+    difference -= np.median(difference[known])
+    return distances, term(known, difference, 0.5 * gradient, -1.0)
 
 
-def _coefficients(A: Float64, g: Float64, target: Intp) -> Float64 | None:
-    """Return the coefficients (MODES,) by the equations (P, MODES, MODES), (P, MODES) of pairs.
+def _by_camera(m: Float64, p: Float64, modes: Float64, *, radial: bool) -> Float64:
+    """Return how distances (N,) along m (N, 3) of points p (N, 3) change with the camera's errors.
 
-    None without strong evidence for any.
+    By the coefficients of the modes (N, MODES) at their pixels, and by the errors of the
+    calibration: (N, UNKNOWNS). See `pair_equation_kernels`.
+    """
+    along = (m * p).sum(1)
+    square = (p * p).sum(1)
+    x, y, z = p.T
+    # What a lateral displacement adds to the range is not kept, if the camera measures that.
+    kept = along / square if radial else np.zeros(len(p))
+    by_x, by_y = m[:, 0] - x * kept, m[:, 1] - y * kept
+    longer = x * by_x + y * by_y
+    errors = [longer, z * by_x, z * by_y, (x * x + y * y) / z**2 * longer, along / np.sqrt(square)]
+    return np.column_stack([modes * (along / z)[:, None], *errors])
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Coefficients and errors (UNKNOWNS,), and how much likelier the views are with a pattern."""
+
+    coefficients: Float64
+    log_ratio: float
+
+
+def _fitted(compared: Sequence[_Compared], coefficients: Float64, inflation: float) -> _Fit:
+    """Fit coefficients with the robust weights at the last ones.
 
     Their variance maximises the likelihood (expectation maximisation). The information is divided
-    by the scatter of the scores of sections of the path, by the targets (P,) of the pairs, relative
-    to that by noise alone: within a section, views share the errors of the scene.
+    by the scatter of the scores of sections of the path, by the targets of the pairs, relative to
+    that by noise alone: within a section, views share the errors of the scene.
     """
+
+    def work(a: int, b: int) -> list[tuple[Float64, Float64]]:
+        return [pair.equations(coefficients, inflation) for pair in compared[a:b]]
+
+    chunks = run_chunks(work, len(compared), -(-len(compared) // _PAIRS_A_CHUNK))
+    A, g = (np.array(terms) for terms in zip(*(pair for c in chunks for pair in c), strict=True))
+    target = np.array([pair.target for pair in compared])
     total, gradient = A.sum(0), g.sum(0)
-    if not total.any():  # no views overlap
-        return None
     section = target * SECTIONS // (int(target.max()) + 1)
-    c, variance, dispersion = np.zeros(_MODES), _FIRST_SIGMA**2, 1.0
+    pattern = np.arange(_MODES)
+    c, variance, dispersion = np.zeros(_UNKNOWNS), _FIRST_SIGMA**2, 1.0
     for _ in range(_ITERATIONS):
-        covariance = np.linalg.inv(total / dispersion + np.eye(_MODES) / variance)
+        prior = np.append(np.full(_MODES, variance), np.full(_ERRORS, USUAL**2))
+        covariance = np.linalg.inv(total / dispersion + np.diag(1 / prior))
         c = -covariance @ gradient / dispersion
-        variance = float(c @ c + np.trace(covariance)) / _MODES
+        variance = float(c[pattern] @ c[pattern] + np.trace(covariance[:_MODES, :_MODES])) / _MODES
         scores = np.zeros((SECTIONS, _MODES))
-        np.add.at(scores, section, g + A @ c)
+        np.add.at(scores, section, (g + A @ c)[:, pattern])
         scatter = float(scores.var(0, ddof=1).sum()) * SECTIONS
-        dispersion = max(scatter / float(np.trace(total)), 1.0)
-    # Of the pattern against none, with the variance that maximises it.
-    log_ratio = -0.5 * float(
-        c @ gradient / dispersion
-        + np.linalg.slogdet(np.eye(_MODES) + variance * total / dispersion)[1]
+        dispersion = max(scatter / float(np.trace(total[:_MODES, :_MODES])), 1.0)
+    without = np.append(np.zeros(_MODES), np.full(_ERRORS, USUAL**2))
+    with_pattern, none = (
+        _log_evidence(total / dispersion, gradient / dispersion, p) for p in (prior, without)
     )
-    return c if log_ratio > _STRONG else None
+    return _Fit(c, with_pattern - none)
+
+
+def _log_evidence(A: Float64, g: Float64, prior: Float64) -> float:
+    """Logarithm of the evidence of normal equations, with prior variances, against all being 0."""
+    covariance = prior[:, None] * np.linalg.inv(np.eye(len(A)) + A * prior)
+    return 0.5 * float(g @ covariance @ g - np.linalg.slogdet(np.eye(len(A)) + A * prior)[1])

@@ -283,22 +283,22 @@ class _Joint(Refiner):
             views[k] = pattern.corrected(view)
         refined = refine(views, poses, alignment, calibrate=self._error_indices, priors=priors)
         aligned = RefinedViews(views, refined, alignment, priors, self._error_indices)
-        split = split_half_errors(aligned)
-        # The pattern would take the effects of a wrong calibration.
-        for k in range(len(views) if pattern.z is not None else 0):
-            views[k] = self._sampled(posed[k])
-        return refined, [(self._check(aligned), split)]
+        return refined, [self._evaluate(aligned)]
 
     def _in_submaps(
         self, posed: _Views, poses: Float64, sensors: external_sensors.SensorPriors
     ) -> tuple[Refined, list[_Evaluation]]:
-        ids = [p.index for p in posed]
+        ids, alignment = [p.index for p in posed], self._options.alignment
+        some = fixed_pattern.runs(len(posed))
+        sampled = [self._sampled(posed[k]) for k in some]
+        pattern = fixed_pattern.estimate(sampled, poses[some], alignment, some)
+        del sampled
         return refine_submaps(
             [self._coarse(p) for p in posed],
             poses,
-            self._options.alignment,
+            alignment,
             self._options.submap,
-            lambda subset: [self._sampled(posed[k]) for k in subset],
+            lambda subset: [pattern.corrected(self._sampled(posed[k])) for k in subset],
             lambda subset: _priors(ids if subset is None else [ids[k] for k in subset], sensors),
             self._evaluate,
             self._error_indices,
@@ -306,13 +306,11 @@ class _Joint(Refiner):
 
     def _evaluate(self, submap: RefinedViews) -> _Evaluation:
         """Evaluate a submap while its views are in memory."""
-        return self._check(submap), split_half_errors(submap)
-
-    def _check(self, aligned: RefinedViews) -> CalibrationCheck:
+        split = split_half_errors(submap)
         if not self._error_indices:
-            return check_calibration(aligned)
-        gap = loop_gap(aligned, aligned.refined.poses, aligned.refined.errors)
-        return CalibrationCheck(gap=gap)
+            return check_calibration(submap), split
+        gap = loop_gap(submap, submap.refined.poses, submap.refined.errors)
+        return CalibrationCheck(gap=gap), split
 
     def _coarse(self, posed: PosedView[PreparedView]) -> SpilledCoarseView:
         surface = _surface(posed)
