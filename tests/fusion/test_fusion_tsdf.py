@@ -18,9 +18,10 @@ from tofuse.engine.fusion.block_kernels import (
 )
 from tofuse.engine.fusion.model import ModelBuilder
 from tofuse.engine.fusion.options import Fusion
-from tofuse.engine.fusion.range_view import DECODED, RangeView, with_camera_correction
+from tofuse.engine.fusion.range_view import DECODED, CameraCorrection, RangeView
 from tofuse.engine.fusion.tsdf import fuse_surface
 from tofuse.engine.geometry import se3
+from tofuse.engine.refinement.fixed_pattern import FixedPattern
 from tofuse.engine.refinement.refinement import without_errors
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
@@ -322,7 +323,8 @@ def test_camera_errors_are_corrected_in_images_as_in_points() -> None:
     frame = frame_of(rng.uniform(1, 3, (72, 88)))
     errors = {"offset": 0.03, "scale": -0.01, "focal": 0.02}
     view = RangeView.of(frame)
-    found = list(with_camera_correction([view, view], errors))
+    correction = CameraCorrection(errors)
+    found = [correction(view), correction(view)]
     expected = without_errors(view.as_cloud().points, errors)
     np.testing.assert_allclose(found[1].as_cloud().points, expected, atol=2e-3)
     assert found[0].projection is found[1].projection
@@ -339,6 +341,17 @@ def test_camera_errors_are_corrected_in_images_as_in_points() -> None:
     builder.add(frame_of(plane_range(EYE, np.array([0, 0, 1.0]), 2.0)), None, 1000)
     z = builder.fuse({0: EYE}, errors={"scale": 0.05}).mesh.vertices[:, 2]
     np.testing.assert_allclose(z, 2.1, atol=0.003)
+
+
+def test_depth_errors_that_are_fixed_to_the_camera_are_removed_from_the_surface() -> None:
+    wave = 0.01 * np.sin(np.linspace(0, 2 * np.pi, 88))[None] * np.ones((72, 1))
+    builder = ModelBuilder(Fusion())
+    builder.add(frame_of(plane_range(EYE, np.array([0, 0, 1.0]), 2.0) - wave), None, 1000)
+    with_errors = builder.fuse({0: EYE}).mesh.vertices[:, 2]
+    pattern = FixedPattern(wave[::2, ::2].astype(np.float32))
+    without = builder.fuse({0: EYE}, pattern=pattern).mesh.vertices[:, 2]
+    assert with_errors.std() > 0.005
+    assert without.std() < 0.2 * with_errors.std()
 
 
 def test_builder_keeps_clouds_within_memory_limit() -> None:

@@ -17,9 +17,9 @@ from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.fusion.cloud import Cloud, CloudBuilder, as_cloud, choose_voxel
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.fusion.options import Fusion
-from tofuse.engine.fusion.range_view import RangeView, StoredViews
+from tofuse.engine.fusion.range_view import CameraCorrection, RangeView, StoredViews
 from tofuse.engine.fusion.tsdf import fitting_voxel, fuse_surface
-from tofuse.engine.refinement import without_errors
+from tofuse.engine.refinement import fixed_pattern, without_errors
 from tofuse.engine.stopwatch import timing
 from tofuse.engine.views import PreparedView
 
@@ -96,6 +96,7 @@ class ModelBuilder:
         poses: Mapping[int, Float64],
         advance: Callable[[], None] | None = None,
         errors: Mapping[str, float] = MappingProxyType({}),
+        pattern: fixed_pattern.FixedPattern = fixed_pattern.NONE,
     ) -> Model:
         """Make the model.
 
@@ -105,8 +106,8 @@ class ModelBuilder:
             T_world_camera (4, 4) by frame index; views of other frames are left out.
         advance
             Called after each view.
-        errors
-            Errors of the camera to correct; see `Refinement.errors`.
+        errors, pattern
+            Errors of the camera to correct; see `Refinement`.
         """
         if not self.surface:
             return Model(self.sketch(poses), None)
@@ -117,9 +118,9 @@ class ModelBuilder:
             )
             return Model(self._average(clouds, poses, self._voxel_m, advance), None)
         views = self._ranges.of(poses)
-        has_errors = any(errors.values())
-        if has_errors:
-            views = views.corrected(errors)
+        correction = CameraCorrection(errors, pattern)
+        if correction:
+            views = views.corrected(correction)
         T_world_camera = np.array([poses[summary.index] for summary in views.summaries], float)
         mesh = fuse_surface(views, T_world_camera, self._options, advance)
         if len(mesh):
@@ -128,8 +129,6 @@ class ModelBuilder:
         else:
             clouds = (view.as_cloud() for view in views)
             model = Model(self._average(clouds, poses, self._range_voxel), mesh)
-        if has_errors:
-            views.drop()
         return model
 
     def sketch(self, poses: Mapping[int, Float64]) -> Cloud:

@@ -5,7 +5,7 @@ The stored views of a recording: in memory up to a limit, the others on disk.
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -18,6 +18,7 @@ from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.compute import Spill, median
 from tofuse.engine.frames import CloudFrame, RangeFrame
 from tofuse.engine.fusion.tsdf_kernels import StoredView, mark_jumps, pack_view, shrink_to_planes
+from tofuse.engine.refinement import fixed_pattern
 from tofuse.engine.views import (
     PreparedView,
     Projection,
@@ -217,27 +218,55 @@ def _typical_sigma(variance: Float32, usable: Bool) -> float:
     return 0.0
 
 
-def with_camera_correction(
-    views: Iterable[RangeView], errors: Mapping[str, float]
-) -> Iterator[RangeView]:
-    """Yield views corrected for these errors of the camera; see `Refinement.errors`."""
-    focal_factor = 1 + errors.get("focal", 0.0)
-    corrected: dict[int, Projection] = {}  # shared by views, as the original
-    for view in views:
-        projection = view.projection
-        if id(projection) not in corrected:
-            frame = projection.frame * np.repeat([focal_factor, 1 / focal_factor], 2)
-            corrected[id(projection)] = Projection(
-                np.asarray(projection.rays * np.float32(focal_factor)), projection.lookup, frame
-            )
+class CameraCorrection:
+    """Removes errors of the camera from its views.
+
+    Parameters
+    ----------
+    errors, pattern
+        As of `Refinement`.
+    """
+
+    def __init__(
+        self, errors: Mapping[str, float], pattern: fixed_pattern.FixedPattern = fixed_pattern.NONE
+    ) -> None:
+        self._errors, self._pattern = errors, pattern
+        # Shared by views, as what they are of.
+        self._projections: dict[int, tuple[Projection, Projection]] = {}
+        self._patterns: dict[tuple[int, ...], Float32] = {}
+
+    def __bool__(self) -> bool:
+        """Whether there are any."""
+        return self._pattern.z is not None or any(self._errors.values())
+
+    def __call__(self, view: RangeView) -> RangeView:
+        """Return a view without these errors."""
+        errors, projection = self._errors, view.projection
         z = view.z * np.float32(view.unit)
+        if self._pattern.z is not None:
+            shape = z.shape
+            if shape not in self._patterns:
+                resized = cv2.resize(self._pattern.z, shape[::-1])
+                self._patterns[shape] = np.asarray(resized, np.float32)
+            z += np.where(z > 0, self._patterns[shape], 0)
         z = z * np.float32(1 + errors.get("scale", 0.0)) + np.where(
             z > 0, np.float32(errors.get("offset", 0.0)) / np.sqrt(projection.lengths2), 0
         )
         z = np.maximum(np.nan_to_num(z), 0)
         unit = max(float(z.max(initial=0.0)), 1e-3) / 65535
         counts = np.round(z / unit).astype(np.uint16)
-        yield replace(view, z=counts, unit=unit, projection=corrected[id(projection)])
+        return replace(view, z=counts, unit=unit, projection=self._corrected(projection))
+
+    def _corrected(self, projection: Projection) -> Projection:
+        focal_factor = 1 + self._errors.get("focal", 0.0)
+        if focal_factor == 1:
+            return projection
+        if id(projection) not in self._projections:
+            frame = projection.frame * np.repeat([focal_factor, 1 / focal_factor], 2)
+            rays = np.asarray(projection.rays * np.float32(focal_factor))
+            wider = Projection(rays, projection.lookup, frame)
+            self._projections[id(projection)] = projection, wider
+        return self._projections[id(projection)][1]
 
 
 def _weight_codes(weight: Float32) -> UInt8:
@@ -310,9 +339,9 @@ class StoredViews:
         Of all views, without reading them.
     """
 
-    def __init__(self, spill: Spill[RangeView]) -> None:
+    def __init__(self, spill: Spill[RangeView], correction: CameraCorrection | None = None) -> None:
         self.summaries: list[ViewSummary] = []
-        self._spill = spill
+        self._spill, self._correction = spill, correction
         self._numbers: list[int] = []
 
     def add(self, view: RangeView) -> None:
@@ -335,27 +364,21 @@ class StoredViews:
                 selected.summaries.append(summary)
         return selected
 
-    def corrected(self, errors: Mapping[str, float]) -> StoredViews:
-        """Add the views without these errors of the camera to the store."""
-        corrected = StoredViews(self._spill)
-        for view in with_camera_correction(self, errors):
-            corrected.add(view)
+    def corrected(self, correction: CameraCorrection) -> StoredViews:
+        """Return these views, without some errors whenever they are read."""
+        corrected = StoredViews(self._spill, correction)
+        corrected.summaries, corrected._numbers = self.summaries, self._numbers
         return corrected
-
-    def drop(self) -> None:
-        """Remove these views from the store."""
-        for number in self._numbers:
-            self._spill.drop(number)
-        self.summaries, self._numbers = [], []
 
     def __len__(self) -> int:
         return len(self._numbers)
 
     def __getitem__(self, index: int, /) -> RangeView:
-        return self._spill.get(self._numbers[index])
+        view = self._spill.get(self._numbers[index])
+        return view if self._correction is None else self._correction(view)
 
     def __iter__(self) -> Iterator[RangeView]:
-        return (self._spill.get(number) for number in self._numbers)
+        return (self[k] for k in range(len(self)))
 
 
 def summaries(views: Views) -> Sequence[ViewSummary]:

@@ -234,7 +234,10 @@ class BackEnd:
         self._progress.stage("fusing", model.views)
         ids = graph.ids.tolist()
         fused = model.fuse(
-            dict(zip(ids, graph.poses, strict=True)), self._progress.advance, refinement.errors
+            dict(zip(ids, graph.poses, strict=True)),
+            self._progress.advance,
+            refinement.errors,
+            refinement.pattern,
         )
         limit, count = self._config.fusion.faces, len(fused.mesh.faces) if fused.mesh else 0
         if 0 < limit < count:

@@ -10,7 +10,12 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.refinement import calibration_check, joint_alignment, plane_refinement
+    from tofuse.engine.refinement import (
+        calibration_check,
+        fixed_pattern,
+        joint_alignment,
+        plane_refinement,
+    )
     from tofuse.engine.refinement.joint_alignment import Priors
     from tofuse.engine.refinement.refinement import (
         AlreadyRefined,

@@ -10,6 +10,9 @@ relative pose of each pair of views free.
 The pattern is a sum of cosines, whose coefficients have one variance, which the views tell as well
 (empirical Bayes): where there is no pattern, it vanishes. Other errors, such as multipath, differ
 from view to view, and their scatter divides the information.
+
+Errors of triangulation, in the disparity, grow with the squared depth. Where that is likelier they
+are left alone: they reach centimetres, and the recorded images would no longer agree.
 """
 
 from __future__ import annotations
@@ -38,9 +41,6 @@ _MODES = len(_ORDERS)
 # distortion and range offset, as in `calibration_check`.
 _ERRORS = 5
 _UNKNOWNS = _MODES + _ERRORS
-# The errors of time of flight are the same at each depth, those of triangulation, in the disparity,
-# grow with its square: powers that are tried.
-_POWERS = 0.0, 2.0
 # Views are compared with the ones this many later, and at most so many pairs in all.
 _LAGS, _MAX_PAIRS = (1, 2, 4, 8), 200
 _PAIRS_A_CHUNK = 8
@@ -67,72 +67,24 @@ class FixedPattern:
     Attributes
     ----------
     z
-        (H, W) m, along the ray, at `depth`, with a mean of about 0; None without strong evidence
-        for any.
-    depth
-        m.
-    power
-        Of the depth, to which the errors are proportional.
+        (H, W) m, along the ray, with a mean of about 0; None without strong evidence for any.
     """
 
     z: Float32 | None
-    depth: float = 1.0
-    power: float = 0.0
 
     def corrected(self, view: SampledView) -> SampledView:
         """Return a view without these errors: its points, and the planes of its target image."""
         if self.z is None:
             return view
         points, target = view.points.copy(), view.target.copy()
-        z = points[:, 2]
-        points[:, :3] *= (1 + self._at(z, self.z.ravel()[_pixels(view)]) / z)[:, None]
-        along = (target[..., :2] * view.projection.rays).sum(-1) + target[..., 2]
+        points[:, :3] *= (1 + self.z.ravel()[_pixels(view)] / points[:, 2])[:, None]
+        shift = (target[..., :2] * view.projection.rays).sum(-1) + target[..., 2]
         distance = target[..., residual_kernels.DISTANCE]
-        # Of pixels without a plane, both are 0.
-        scale = np.float32(view.target_scale)
-        of_planes = np.divide(distance * scale, along, out=np.zeros_like(along), where=along != 0)
-        distance += np.where(distance != 0, along * self._at(of_planes, self.z) / scale, 0)
+        distance += np.where(distance != 0, shift * self.z / np.float32(view.target_scale), 0)
         return replace(view, points=points, target=target)
 
-    def _at(self, z: Float32, pattern: Float32) -> Float32:
-        """Return the pattern, of some pixels, at their depths z, m."""
-        return np.asarray(pattern * (z / np.float32(self.depth)) ** np.float32(self.power))
 
-
-@dataclass(frozen=True, eq=False)
-class _Modes:
-    """Cosines over the image.
-
-    Attributes
-    ----------
-    values
-        (H W, MODES).
-    depth, power
-        As of `FixedPattern`.
-    """
-
-    values: Float64
-    depth: float
-    power: float
-
-    @classmethod
-    def of(cls, shape: tuple[int, ...], depth: float, power: float) -> _Modes:
-        """Return those of an image (H, W)."""
-        v, u = np.indices(shape).reshape(2, -1)
-        phase = np.pi * (np.stack([u, v], 1) + 0.5) / shape[::-1]
-        values = np.prod(np.cos(phase[:, None] * _ORDERS), axis=2)
-        return cls(np.asarray(values, np.float64), depth, power)
-
-    def at(self, pixels: Intp, z: Float64) -> Float64:
-        """Return the (N, MODES) changes of the depth of points at pixels (N,) and depths (N,)."""
-        return np.asarray(
-            self.values[pixels] * ((z / self.depth) ** self.power)[:, None], np.float64
-        )
-
-    def pattern(self, coefficients: Float64, shape: tuple[int, ...]) -> FixedPattern:
-        """Return the sum of the modes."""
-        z = (self.values @ coefficients).astype(np.float32).reshape(shape)
-        return FixedPattern(z, self.depth, self.power)
+NONE = FixedPattern(None)
 
 
 def _pixels(view: SampledView) -> Intp:
@@ -169,19 +121,51 @@ def estimate(
     """
     shape = views[0].target.shape[:2] if views else (0, 0)
     if len(views) < _MIN_VIEWS or any(view.target.shape[:2] != shape for view in views):
-        return FixedPattern(None)
+        return NONE
     pairs = _pairs(np.arange(len(views)) if positions is None else positions)
+    cosines = _cosines(shape)
     depth = float(np.median([view.depth for view in views]))
-    found: list[tuple[float, FixedPattern]] = [(_STRONG, FixedPattern(None))]
-    for power in _POWERS:
-        modes = _Modes.of(shape, depth, power)
+
+    def fitted(power: float) -> _Fit:
+        fit, modes = _Fit(np.zeros(_UNKNOWNS), -np.inf), _Modes(cosines, depth, power)
         compared = _compared(views, pairs, poses, modes, photometric=options.photometric)
-        if compared:
-            fit = _Fit(np.zeros(_UNKNOWNS), 0.0)
-            for inflation in _INFLATIONS:
-                fit = _fitted(compared, fit.coefficients, inflation)
-            found.append((fit.log_ratio, modes.pattern(fit.coefficients[:_MODES], shape)))
-    return max(found, key=lambda item: item[0])[1]
+        for inflation in _INFLATIONS if compared else ():
+            fit = _fitted(compared, fit.coefficients, inflation)
+        return fit
+
+    fit, of_triangulation = fitted(0.0), fitted(2.0)
+    if fit.log_ratio < max(_STRONG, of_triangulation.log_ratio):
+        return NONE
+    return FixedPattern((cosines @ fit.coefficients[:_MODES]).astype(np.float32).reshape(shape))
+
+
+def _cosines(shape: tuple[int, ...]) -> Float64:
+    """Return the modes (H W, MODES) of an image (H, W)."""
+    v, u = np.indices(shape).reshape(2, -1)
+    phase = np.pi * (np.stack([u, v], 1) + 0.5) / shape[::-1]
+    return np.asarray(np.prod(np.cos(phase[:, None] * _ORDERS), axis=2), np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Modes:
+    """Changes of the depth.
+
+    Attributes
+    ----------
+    cosines
+        (H W, MODES).
+    depth, power
+        m, and power of the depth relative to this, to which the changes are proportional.
+    """
+
+    cosines: Float64
+    depth: float
+    power: float
+
+    def at(self, pixels: Intp, z: Float64) -> Float64:
+        """Return the (N, MODES) changes for points at pixels (N,) and depths (N,), m."""
+        changes = self.cosines[pixels] * ((z / self.depth) ** self.power)[:, None]
+        return np.asarray(changes, np.float64)
 
 
 def _pairs(positions: Intp) -> Intp:
@@ -314,6 +298,8 @@ def _terms(
     n, distance = image[:, :3], image[:, k.DISTANCE] * target.target_scale
     m, normal = n @ T[:3, :3], points[:, k.NORMAL : k.NORMAL + 3]
     seen = inside & (distance != 0) & ((m * normal).sum(1) > projective.MIN_COSINE)
+    # Planes fitted to mere noise can have unbounded coefficients.
+    seen &= np.isfinite(image[:, : k.VARIANCE]).all(1) & np.isfinite(normal).all(1)
     if np.count_nonzero(seen) < _MIN_POINTS:
         return ()
 

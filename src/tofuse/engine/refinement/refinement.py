@@ -88,6 +88,8 @@ class Refinement:
         Pairs (i, j) of edges that do not come from the overlap of the two views.
     split_m, split_rad
         Rms errors of the poses by halves of the images (`split_half`); 0 unless kept.
+    pattern
+        Depth errors that are fixed to the camera, if there are any, and the poses are kept.
     """
 
     poses: Float64
@@ -103,6 +105,7 @@ class Refinement:
     non_overlap_edges: tuple[tuple[int, int], ...] = ()
     split_m: float = 0.0
     split_rad: float = 0.0
+    pattern: fixed_pattern.FixedPattern = fixed_pattern.NONE
 
     @property
     def range_change(self) -> RangeChange | None:
@@ -250,7 +253,7 @@ class _Joint(Refiner):
             return Refinement(poses, views=len(posed))
         before = poses[positions]
         refine_views = self._at_once if len(posed) <= options.submap else self._in_submaps
-        refined, evaluated = refine_views(posed, before, sensors)
+        refined, evaluated, pattern = refine_views(posed, before, sensors)
         calibration = combine_checks([check for check, _ in evaluated])
         support = refined.before.of_views(len(posed)), refined.after.of_views(len(posed))
         mean = float(support[0].mean()), float(support[1].mean())
@@ -269,11 +272,12 @@ class _Joint(Refiner):
             split_rad=split_rad,
             errors={name: float(refined.errors[_ERROR_INDEX[name]]) for name in options.calibrate},
             edges=pairwise_measurements([p.index for p in posed], refined),
+            pattern=pattern,
         )
 
     def _at_once(
         self, posed: _Views, poses: Float64, sensors: external_sensors.SensorPriors
-    ) -> tuple[Refined, list[_Evaluation]]:
+    ) -> tuple[Refined, list[_Evaluation], fixed_pattern.FixedPattern]:
         views = [self._sampled(p) for p in posed]
         priors = _priors([p.index for p in posed], sensors)
         alignment = self._options.alignment
@@ -283,17 +287,17 @@ class _Joint(Refiner):
             views[k] = pattern.corrected(view)
         refined = refine(views, poses, alignment, calibrate=self._error_indices, priors=priors)
         aligned = RefinedViews(views, refined, alignment, priors, self._error_indices)
-        return refined, [self._evaluate(aligned)]
+        return refined, [self._evaluate(aligned)], pattern
 
     def _in_submaps(
         self, posed: _Views, poses: Float64, sensors: external_sensors.SensorPriors
-    ) -> tuple[Refined, list[_Evaluation]]:
+    ) -> tuple[Refined, list[_Evaluation], fixed_pattern.FixedPattern]:
         ids, alignment = [p.index for p in posed], self._options.alignment
         some = fixed_pattern.runs(len(posed))
         sampled = [self._sampled(posed[k]) for k in some]
         pattern = fixed_pattern.estimate(sampled, poses[some], alignment, some)
         del sampled
-        return refine_submaps(
+        refined, evaluated = refine_submaps(
             [self._coarse(p) for p in posed],
             poses,
             alignment,
@@ -303,6 +307,7 @@ class _Joint(Refiner):
             self._evaluate,
             self._error_indices,
         )
+        return refined, evaluated, pattern
 
     def _evaluate(self, submap: RefinedViews) -> _Evaluation:
         """Evaluate a submap while its views are in memory."""
