@@ -14,8 +14,8 @@ from tofuse.engine.arrays import Bool, Float32, Float64
 from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.geometry import se3
 
-# Images are downscaled to this width. Smaller ones, and flatter than this ratio of height and width,
-# as of spinning scanners, have too few pixels to be shifted by as much as is tested below.
+# Images are downscaled to this width. Smaller ones, and flatter ones than this ratio of height to
+# width, as of spinning scanners, have too few pixels to be shifted by as much as is tested below.
 _COLUMNS, _MIN_COLUMNS, _MIN_RATIO = 160, 16, 0.5
 # Orientations of one channel relative to the other.
 _ORIENTATIONS: dict[str, Callable[[Float32], Float32]] = {

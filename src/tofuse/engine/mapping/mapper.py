@@ -38,7 +38,8 @@ from tofuse.engine.views import PreparedView
 
 _UNIT = 1e-3  # tolerance of the length of a unit vector
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 def _in_turn(method: Callable[Concatenate[Mapper, P], R]) -> Callable[Concatenate[Mapper, P], R]:
