@@ -88,6 +88,11 @@ def test_unusable_files_are_named(files, tmp_path, capfd) -> None:
     refuses(capfd, "compare", good, tmp_path / "flat.ply", says=("flat.ply", "without area"))
     write_ply(tmp_path / "same.ply", GeometryRecord(np.ones((90, 3), np.float32)))
     refuses(capfd, "compare", good, tmp_path / "same.ply", says=("same.ply", "one place"))
+    (tmp_path / "result").mkdir()
+    (tmp_path / "result" / "run.json").write_text('{"schema": 1, "verd')
+    for command in ("compare", "register", "evaluate"):
+        words = (command, tmp_path / "result", good)
+        refuses(capfd, *words, says=("result/run.json", "damaged", "copy the whole folder"))
     refuses(capfd, "compare", good, part, "--overwrite", says=("requires --out",))
     refuses(capfd, "repeat", tmp_path, says=("two or more",))
     refuses(capfd, "repeat", tmp_path, tmp_path, says=(str(tmp_path),))

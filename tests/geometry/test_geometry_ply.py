@@ -49,6 +49,15 @@ def test_ascii_with_polygons_and_other_elements_is_read(tmp_path: Path) -> None:
     assert ply.comments == ("made by hand",)
 
 
+def test_lists_of_vertices_are_named(tmp_path: Path) -> None:
+    with_lists = CUBE.replace(
+        "property float z\n", "property float z\nproperty list uchar int near\n"
+    )
+    (tmp_path / "a.ply").write_text(with_lists)
+    with pytest.raises(InputError, match="has vertices with lists; export it without"):
+        read_ply(tmp_path / "a.ply")
+
+
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_both_byte_orders_and_mixed_types_are_read(tmp_path: Path, order: str) -> None:
     name = {"<": "little", ">": "big"}[order]

@@ -347,6 +347,32 @@ def test_outline_of_a_turntable_before_nothing_is_not_mirrored() -> None:
     assert not list(check_mirrored(Sample.of(of(frames), 8)))
 
 
+def test_depth_beyond_a_wrong_ambiguity_range_is_not_of_a_wrong_unit() -> None:
+    frames = [image(2.5)]
+    inspected = tofuse.inspect(of(frames, metadata={"ambiguity_m": 0.5}))
+    (found,) = [f for f in inspected.findings if f.code == "depth_unit"]
+    assert found.remedy.startswith("Check ambiguity_m")
+
+
+def test_flat_images_are_inspected(turn) -> None:
+    """Those of a spinning scanner, too flat for shifts of a fraction of the width."""
+    camera = turn[0].camera
+    flat = Pinhole(camera.width, 16, camera.fx, camera.fy, camera.cx, camera.cy - 30)
+    frames = [
+        RangeFrame(
+            f.index,
+            f.timestamp,
+            flat,
+            f.depth[30:46],
+            f.depth_kind,
+            amplitude_image=f.amplitude_image[30:46],
+            color_image=np.ascontiguousarray(f.color_image[30:46]),
+        )
+        for f in colored(turn, 0)
+    ]
+    assert not codes(frames) & {"mirrored", "color_unregistered", "delayed"}
+
+
 def test_colors_of_other_frames_are_not_mirrored(turn) -> None:
     """Their edges are in the same parts of the images."""
     images = [f.color_image for f in colored(turn, 0)]

@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 import shutil
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from time import sleep
 from typing import ClassVar
 
 import numpy as np
@@ -217,7 +219,7 @@ def test_loops_are_given_as_pairs() -> None:
 
 
 def test_no_frames_and_no_usable_frames_are_refused(frames) -> None:
-    with pytest.raises(InputError, match="none of the 0 frames"):
+    with pytest.raises(InputError, match="has no frames"):
         Mapper().finish()
     mapper = Mapper()
     assert mapper.push(blank(frames[0])) is None
@@ -423,3 +425,57 @@ def test_failed_run_states_no_bound(room_recording) -> None:
     assert d.verdict == "failed"
     assert not np.isfinite(d.accuracy.position_m)
     assert "uncertain_poses" not in {reason.code for reason in d.reasons}
+
+
+def test_threads_push_in_turn(frames, monkeypatch) -> None:
+    busy = []
+    process = Mapper._prepare
+
+    def slow(self, *arguments):
+        busy.append(True)
+        sleep(0.01)
+        assert len(busy) == 1
+        filtered = process(self, *arguments)
+        busy.clear()
+        return filtered
+
+    monkeypatch.setattr(Mapper, "_prepare", slow)
+    mapper = Mapper(CONFIG)
+
+    def push(frame) -> bool:
+        try:
+            mapper.push(frame)
+        except InputError:  # comes too late
+            return False
+        return True
+
+    with ThreadPoolExecutor(3) as pool:
+        pushed = list(pool.map(push, frames[:6]))
+    indices = [entry.record.index for entry in mapper.log.entries]
+    assert indices == sorted(indices)
+    assert len(indices) == sum(pushed)
+
+
+def test_signal_in_compiled_code_is_raised_as_itself(frames, monkeypatch) -> None:
+    def interrupted(*_arguments):
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise SystemError("returned a result with an exception set") from error
+
+    mapper = Mapper(CONFIG)
+    mapper.push(frames[0])
+    with monkeypatch.context() as patch:
+        patch.setattr(mapper, "_prepare", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            mapper.push(frames[1])
+    mapper.push(frames[2])
+    assert [f.index for f in mapper.finish().diagnostics.frames] == [0, 2]
+
+
+def test_nothing_can_be_finished_before_the_first_frame(frames) -> None:
+    mapper = Mapper(CONFIG)
+    with pytest.raises(InputError, match="mapper: has no frames; push frames first"):
+        mapper.finish()
+    mapper.push(frames[0])
+    assert len(mapper.finish().trajectory) == 1

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.geometry.quaternion import from_matrix
@@ -25,20 +26,20 @@ def wxyz(T):
     return np.roll(from_matrix(T[:3, :3]), 1)
 
 
-def euroc(path: Path) -> None:
+def euroc(path: Path, times: Float64 = TIMES) -> None:
     lines = ["#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],..."]
-    for time, T in zip(TIMES, POSES, strict=True):
+    for time, T in zip(times, POSES, strict=True):
         # Velocities and biases follow.
         cells = [f"{round(1e9 * time)}", *(repr(float(v)) for v in (*T[:3, 3], *wxyz(T), 1, 2, 3))]
         lines.append(",".join(cells))
     path.write_text("\n".join(lines) + "\n")
 
 
-def orb_slam3(path: Path) -> None:
+def orb_slam3(path: Path, times: Float64 = TIMES) -> None:
     """What ORB-SLAM3 calls EuRoC: times in ns, the quaternion in the order of TUM."""
     rows = [
         f"{1e9 * time:.6f} " + " ".join(str(float(v)) for v in (*T[:3, 3], *from_matrix(T[:3, :3])))
-        for time, T in zip(TIMES, POSES, strict=True)
+        for time, T in zip(times, POSES, strict=True)
     ]
     path.write_text("\n".join(rows) + "\n")
 
@@ -206,3 +207,12 @@ def test_true_error_is_within_interval() -> None:
         reference, estimate = off(truth, 0.01), off(truth, 0.005)
         low, high = ate(estimate, reference).ate_within(ate(reference, truth).ate_rms_m)
         assert low <= ate(estimate, truth).ate_rms_m <= high
+
+
+@pytest.mark.parametrize("write", [euroc, orb_slam3])
+def test_nanoseconds_may_begin_at_zero(write, tmp_path: Path) -> None:
+    times = 5.0 * np.arange(5)
+    write(tmp_path / "a.txt", times)
+    read = read_poses(tmp_path / "a.txt")
+    np.testing.assert_allclose(read.timestamps, times)
+    np.testing.assert_allclose(read.poses, POSES, atol=1e-9)

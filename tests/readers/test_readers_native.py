@@ -427,6 +427,23 @@ def test_a_first_image_of_another_size_is_one_frame_without_it(tmp_path: Path) -
         open_recording(folder)
 
 
+def test_color_for_display_may_have_any_size(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", 2)
+    (folder / "color").mkdir(exist_ok=True)
+    for k in range(2):
+        write_png(folder / "color" / f"{k:06}.png", np.full((90, 160, 3), 100, np.uint8))
+    with pytest.raises(InputError, match=r'"color_registered": false'):
+        open_recording(folder)
+    edit(folder, color_registered=False)
+    frame = open_recording(folder)[0]
+    assert not frame.color_registered
+    assert frame.color_image.shape == (30, 40, 3)
+    lens = {"width": 160, "height": 90, "fx": 100, "fy": 100, "cx": 80, "cy": 45}
+    edit(folder, color={"intrinsics": lens})
+    with pytest.raises(InputError, match="T_color_depth: is missing"):
+        open_recording(folder)
+
+
 def test_writer_refuses_invalid_frames(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "a", PINHOLE)
     with pytest.raises(InputError, match="no frames"):

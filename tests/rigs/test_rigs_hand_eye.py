@@ -55,6 +55,13 @@ def test_unrelated_signals_determine_no_lag() -> None:
     assert not lag.certain
 
 
+def test_short_noise_seldom_determines_a_lag() -> None:
+    times = np.arange(15) / 10
+    signals = (np.random.default_rng(k).normal(size=(2, 15)) for k in range(300))
+    lags = [lag_between(times, first, times, second) for first, second in signals]
+    assert sum(lag.certain for lag in lags) <= 6
+
+
 def test_hand_eye_finds_pose_and_clock() -> None:
     a, b = tracks()
     found = hand_eye(a, b, 0.0)

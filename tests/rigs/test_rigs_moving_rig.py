@@ -5,15 +5,22 @@ from functools import cache
 import numpy as np
 import pytest
 
+from boxes_in_room import views_in_room
 from pose_errors import assert_near, pose_error
 from rig_room import ROOM
 from rig_scene import CAMERA, looked_at
 from tofuse.apps.rigs.calibrating import calibrate_cameras
 from tofuse.apps.rigs.hand_eye import HandEye, Track, hand_eye
 from tofuse.apps.rigs.inputs import Calibration, Camera
-from tofuse.apps.rigs.moving_rig import _initial_offset, _JointViews, _too_uncertain
+from tofuse.apps.rigs.moving_rig import (
+    _common_world,
+    _initial_offset,
+    _JointViews,
+    _too_uncertain,
+)
 from tofuse.apps.rigs.rig_trajectory import refined
 from tofuse.apps.rigs.run import reconstruct_rig
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
@@ -215,6 +222,32 @@ def test_rotation_about_one_axis_does_not_constrain_spacing_along_it() -> None:
     assert sigma[1] > 0.5  # along the axis, whatever noise suggests
     assert sigma[[0, 2]].max() < 0.01
     assert (np.abs(off) < 3 * sigma + 1e-4).all()
+
+
+def test_registered_views_decide_what_the_motion_leaves_open() -> None:
+    """A rig that only turns about the vertical: any height of the second camera fits it."""
+    lens = Pinhole(80, 60, 60.0, 60.0, 39.5, 29.5)
+    mount = se3.pose(rotation([0.0, 0.3, 0.0])[:3, :3], np.array([0.2, 0.0, 0.05]))
+    world = np.stack([rotation([0.0, 0.04 * k, 0.0]) for k in range(14)])
+    times = np.arange(14) / 10.0
+    rig, tracks = [], []
+    for k, T in enumerate((np.eye(4), mount)):
+        poses = world @ T
+        frames = views_in_room(lens, poses, 0.002, seed=k)
+        rig.append(Camera(f"cam{k}", Recording.of(ArraySource(frames), f"cam{k}", "array")))
+        tracks.append(Track(times, se3.inverse(poses[0]) @ poses))
+    off = se3.translation((0.0, 0.6, 0.0))
+    open_fit = HandEye(off @ mount, np.diag([1.0] * 3 + [0.01] * 3), off @ mount, 0.0, 0.01)
+    assert_near(_common_world(rig, tracks, 1, open_fit).T_a_b, mount, 0.02, 0.5)
+    certain = HandEye(mount, 1e-6 * np.eye(6), mount, 0.0, 0.01)
+    assert _common_world(rig, tracks, 1, certain) is certain
+    elsewhere = [
+        RangeFrame(f.index, f.timestamp, lens, np.full_like(f.depth, 30.0))
+        for f in rig[1].recording
+    ]
+    rig[1] = Camera("cam1", Recording.of(ArraySource(elsewhere), "cam1", "array"))
+    with pytest.raises(RegistrationError, match="rotate the rig about two axes"):
+        _common_world(rig, tracks, 1, open_fit)
 
 
 def test_motion_in_all_directions_constrains_camera() -> None:

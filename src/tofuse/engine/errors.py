@@ -80,6 +80,22 @@ class Ended(BaseException):
         super().__init__(number)
 
 
+@contextmanager
+def signals_as_themselves() -> Iterator[None]:
+    """Raise a signal that arrived in compiled code as itself, not as the cause of a SystemError."""
+    try:
+        yield
+    except SystemError as error:
+        cause: BaseException | None = error
+        while isinstance(cause, SystemError):
+            cause = cause.__cause__ or cause.__context__
+        if isinstance(cause, KeyboardInterrupt | Ended):
+            for note in getattr(error, "__notes__", ()):
+                cause.add_note(note)
+            raise cause from None
+        raise
+
+
 class InputError(TofuseError):
     """A recording, file, option or array from outside can't be used."""
 

@@ -220,31 +220,15 @@ def _print_error(text: str) -> None:
     print("tofuse: " + " ".join(text.split()), file=sys.stderr)
 
 
-def _run_unwrapped(command: Callable[[], int]) -> int:
-    """Run a command; a signal that arrived during a call of compiled code is raised as itself."""
-    from tofuse.engine.errors import Ended
-
-    try:
-        return command()
-    except SystemError as error:
-        cause: BaseException | None = error
-        while isinstance(cause, SystemError):
-            cause = cause.__cause__ or cause.__context__
-        if isinstance(cause, KeyboardInterrupt | Ended):
-            for note in getattr(error, "__notes__", ()):
-                cause.add_note(note)
-            raise cause from None
-        raise
-
-
 def run_command(command: Callable[[], int]) -> int:
     """Return the exit status of a command; errors are printed in one line."""
     from tofuse.apps.cli.streams import safe_streams
-    from tofuse.engine.errors import Ended, TofuseError, on_command_line
+    from tofuse.engine.errors import Ended, TofuseError, on_command_line, signals_as_themselves
 
     with safe_streams(), on_command_line():
         try:
-            return _run_unwrapped(command)
+            with signals_as_themselves():
+                return command()
         except TofuseError as error:
             _print_error(str(error))
             return 2

@@ -96,7 +96,7 @@ def surface_of(given: Comparable, name: str = "") -> Surface:
         return _of_record(GeometryRecord(given), name or "points")
     remedy = "pass a result, a mesh, a cloud, (N, 3) points, or the path of one"
     path = reading.path_of(given, name or "surface", remedy)
-    if folders.is_result(path):
+    if folders.named_result(path):
         return _of_result(load_result(path), str(path))
     if is_surface(path):
         return _of_record(read_surface(path), str(path))

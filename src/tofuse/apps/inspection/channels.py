@@ -14,8 +14,9 @@ from tofuse.engine.arrays import Bool, Float32, Float64
 from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.geometry import se3
 
-# Images are downscaled to this width.
-_COLUMNS = 160
+# Images are downscaled to this width. Smaller ones, and flatter ones than this ratio of height to
+# width, as of spinning scanners, have too few pixels to be shifted by as much as is tested below.
+_COLUMNS, _MIN_COLUMNS, _MIN_RATIO = 160, 16, 0.5
 # Orientations of one channel relative to the other.
 _ORIENTATIONS: dict[str, Callable[[Float32], Float32]] = {
     "as it is": lambda a: a,
@@ -52,7 +53,7 @@ def check_mirrored(sample: Sample) -> Iterator[Finding]:
         # Without the outline of what has a depth, which is no edge of depth.
         images = [
             (_oriented_edges(_log_depth(f)), _filled(image, f.valid))
-            for f in sample.images
+            for f in _shiftable(sample.images)
             if (image := channel_of(f)) is not None
         ]
         if len(images) < _MIN_FRAMES:
@@ -103,7 +104,8 @@ def _match_own_frame(edges: Sequence[tuple[Float32, Float32]]) -> bool:
 
 def check_color(sample: Sample) -> Iterator[Finding]:
     """Check that the edges of colour coincide with those of depth."""
-    edges = _edge_pairs([f for f in sample.images if f.color_registered], _grey)
+    images = _shiftable(sample.images)
+    edges = _edge_pairs([f for f in images if f.color_registered], _grey)
     if len(edges) < _MIN_FRAMES:
         return
     columns = edges[0][0].shape[1]
@@ -120,7 +122,7 @@ def check_color(sample: Sample) -> Iterator[Finding]:
     )
     lead = best - unshifted
     if is_clear and shift > _MIN_SHIFT and is_significant(lead, _MIN_COLOR_LEAD, _MIN_LEAD_SIGMAS):
-        pixels = shift * sample.images[0].camera.width
+        pixels = shift * images[0].camera.width
         yield Finding(
             "color_unregistered",
             f"Colour is not registered to depth: its edges lie {pixels:.0f} pixels away from "
@@ -142,12 +144,13 @@ def check_delay(sample: Sample) -> Iterator[Finding]:
             {"held": held, "pairs": len(sample.steps)},
         )
         return
-    images = {frame.index: frame for frame in sample.images}
+    images = {frame.index: frame for frame in _shiftable(sample.images)}
     moving = [
         (images[view.index], pair.alignment.T_world_source)
         for pair in sample.pairs
         if pair.fits
         for view in (pair.first, pair.second)
+        if view.index in images
     ]
     shifts, motions = [], []
     for frame, T_first_second in moving:
@@ -285,6 +288,15 @@ def _gradient(image: Float32) -> tuple[Float32, Float32]:
     saturation = max(float(np.percentile(strength, 95)) or 1.0, 1e-6)
     scale = (1 / np.maximum(strength, saturation)).astype(np.float32)
     return np.asarray(x * scale, np.float32), np.asarray(y * scale, np.float32)
+
+
+def _shiftable(images: Sequence[RangeFrame]) -> list[RangeFrame]:
+    return [
+        image
+        for image in images
+        if image.camera.width >= _MIN_COLUMNS
+        and image.camera.height >= _MIN_RATIO * image.camera.width
+    ]
 
 
 def _edge_pairs(

@@ -64,9 +64,10 @@ def check_times(sample: Sample) -> Iterator[Finding]:
     gaps = forward[forward > _MIN_GAP * interval]
     missing = int(np.round(gaps / interval).sum()) - len(gaps)
     if _is_regular(forward, interval) and missing > _MAX_MISSING_FRACTION * len(times):
+        are = " is" if missing == 1 else "s are"
         yield Finding(
             "frames_missing",
-            f"About {missing} frames are missing: the timestamps have {len(gaps)} "
+            f"About {missing} frame{are} missing: the timestamps have {len(gaps)} "
             f"gap{'s' if len(gaps) > 1 else ''} of up to {gaps.max():.3g} s; the median "
             f"interval is {interval:.3g} s.",
             "Record to a faster disk, or at a lower rate; tracking may fail at the gaps.",

@@ -90,6 +90,8 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
     # The power of ten by which the distance is nearest to 2 m.
     factor = float(10.0 ** np.round(np.log10(median / 2.0)))
     remedy = f"Check depth_unit_m: it may be wrong by a factor of {factor:g}."
+    if factor == 1:
+        remedy = "Check ambiguity_m: it is the range of one phase period."
     if not sample.images:
         remedy = f"Coordinates are read as metres: multiply those in the files by {1 / factor:g}."
     yield Finding(

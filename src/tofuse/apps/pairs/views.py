@@ -68,7 +68,7 @@ def named_view(
 ) -> SingleView:
     """Read the view called `name`: the cloud of a result, or see `open_view`."""
     folder = Path(name)
-    if format is None and folders.is_result(folder):
+    if format is None and folders.named_result(folder):
         cloud = read_cloud(folder)
         frame = CloudFrame.of(_checked(cloud.points, name))
         return SingleView(name, name, "result", 0, frame)

@@ -278,8 +278,21 @@ def result_of_poses(path: Path) -> Path | None:
     """Return the result whose poses a path names: itself, or by its trajectory.txt; else None."""
     if path.name == "trajectory.txt":
         return path.parent if is_result(path.parent) else None
-    # Nothing else that is read has a run.json, so that a damaged one is reported.
-    return path if (path / RESULT.marker).is_file() else None
+    return path if named_result(path) else None
+
+
+def named_result(path: Path) -> bool:
+    """Whether a path names the folder of a result, which is checked.
+
+    Raises
+    ------
+    InputError
+        If its run.json is damaged: nothing else that is read has one.
+    """
+    if not (path / RESULT.marker).is_file():
+        return False
+    check_result(path)
+    return True
 
 
 def read_json_object(path: Path) -> dict[str, object] | None:

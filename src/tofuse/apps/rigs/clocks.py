@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 from scipy.signal import fftconvolve, find_peaks
 
 from tofuse.engine.arrays import Float64
@@ -19,6 +20,8 @@ _OVERLAP, _MIN_SAMPLES = 0.5, 12
 _OVERSAMPLING = 4
 # Largest ratio of another peak, outside the main one, to the best; minimum correlation.
 _MAX_RIVAL, _MIN_CORRELATION = 0.8, 0.7
+# Maximum probability that noise correlates as much at some lag: short signals do.
+_MAX_CHANCE = 0.01
 _MAX_LAGS = 200_000
 
 
@@ -75,7 +78,17 @@ def lag_between(
     shift = (best + subsample - (len(second) - 1)) * step
     seconds = float(times[0] + shift - other_times[0])
     certain = peak >= _MIN_CORRELATION and rival <= _MAX_RIVAL * peak
-    return Lag(seconds, peak, certain)
+    lag = best - (len(second) - 1)
+    overlap = min(len(first), lag + len(second)) - max(lag, 0)
+    lags = np.isfinite(correlation).sum() / _OVERSAMPLING
+    chance = lags * _chance(peak, overlap / _OVERSAMPLING)
+    return Lag(seconds, peak, bool(certain and chance <= _MAX_CHANCE))
+
+
+def _chance(correlation: float, samples: float) -> float:
+    """Return the probability that noise correlates by as much, by Fisher's transformation."""
+    z = np.arctanh(min(correlation, 1 - 1e-9)) * np.sqrt(max(samples - 3, 0.0))
+    return float(stats.norm.sf(z))
 
 
 def _resampled(times: Float64, values: Float64, step: float) -> Float64:

@@ -141,7 +141,7 @@ def combined(a: HandEye, b: HandEye) -> HandEye:
     )
 
 
-def _common(a: Track, b: Track, offset: float) -> tuple[Float64, Float64, Float64]:
+def common_poses(a: Track, b: Track, offset: float) -> tuple[Float64, Float64, Float64]:
     """Return the times of a's poses at which b has a pose too, and the poses of both."""
     T_b, valid = b.at(a.times - offset)
     if valid.sum() < _MIN_COMMON:
@@ -156,7 +156,7 @@ def _initial_estimate(
     a: Track, b: Track, offset: float, *, common_world: bool
 ) -> tuple[Float64, Float64]:
     """Return X and Y by Tsai and Lenz, from relative motions over several spans."""
-    _, T_a, T_b = _common(a, b, offset)
+    _, T_a, T_b = common_poses(a, b, offset)
     if common_world:
         return median_pose(se3.inverse(T_a) @ T_b), np.eye(4)
     motions_a, motions_b = [], []
@@ -207,7 +207,7 @@ class _Fit:
 
         The residuals are log((T_a X)^-1 Y T_b) at the common times.
         """
-        times, T_a, _ = _common(self.a, self.b, self.offset)
+        times, T_a, _ = common_poses(self.a, self.b, self.offset)
 
         def residuals(step: Float64) -> Float64:
             X, Y, offset = self.moved(step)

@@ -1,17 +1,26 @@
 """Calibration of a moving rig: cameras are tracked separately, and their trajectories aligned.
 
 The cameras need not overlap at any instant. Views of the same place at different times are used in
-a joint refinement of all views, once the trajectories are in one world frame.
+a joint refinement of all views, once the trajectories are in one world frame. Where the motion does
+not determine that, as of a rig that only turns about the vertical, registered views do.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from tofuse.apps.rigs.hand_eye import HandEye, Track, clock_of, combined, hand_eye
+from tofuse.apps.rigs.hand_eye import (
+    HandEye,
+    Track,
+    clock_of,
+    combined,
+    common_poses,
+    hand_eye,
+    median_pose,
+)
 from tofuse.apps.rigs.inputs import Calibration, Camera, disagreement_rows
 from tofuse.apps.rigs.joint import SurfaceDistances, disagreements_of
 from tofuse.engine.arrays import Float64
@@ -21,11 +30,15 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import reconstructing
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.refinement import joint_alignment, propagate_poses, refined_by_halves
+from tofuse.engine.search import are_distinct_poses, register_pair
 from tofuse.engine.stored_views import SampledView, pair_equations
+from tofuse.engine.views import PreparedView
 from tofuse.formats.rigs import Rig, RigCamera
 
 # Number of views of each camera that are refined jointly, and of their points.
 _VIEWS, _POINTS = 70, 1500
+# Number of views of each camera that are registered with those of another one.
+_REGISTERED = 4
 # Clock differences above this, s, are reported.
 _MAX_CLOCK_DIFFERENCE_S = 0.5
 # Maximum sigma of a placed camera: fraction of the depth, and rad.
@@ -59,7 +72,8 @@ def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> Calibrati
     for k in range(1, len(cameras)):
         try:
             offset = _initial_offset(cameras, tracks, k, notes)
-            fits[k] = hand_eye(tracks[0], tracks[k], offset)
+            fit = hand_eye(tracks[0], tracks[k], offset)
+            fits[k] = _common_world(cameras, tracks, k, fit)
         except RegistrationError as error:
             reasons[k] = str(error)
     progress.stage("refining")
@@ -135,6 +149,51 @@ def _initial_offset(
     return 0.0
 
 
+def _common_world(
+    cameras: Sequence[Camera], tracks: Sequence[Track], k: int, fit: HandEye
+) -> HandEye:
+    """Return a fit from which all views can be refined: by registered views if it is uncertain.
+
+    The refinement is local. It would find an agreement, but not the right one, from any pose along
+    a direction that the motion does not determine.
+
+    Raises
+    ------
+    RegistrationError
+        If the registrations do not agree either.
+    """
+    first, second = (
+        [(tracks[c].poses[p], view) for p, view in _views(cameras[c], tracks[c], _REGISTERED)]
+        for c in (0, k)
+    )
+    reason = _too_uncertain(fit, float(np.median([view.depth for _, view in first])))
+    if not reason:
+        return fit
+    worlds = [
+        T_first @ found.T_target_source @ se3.inverse(T_second)
+        for T_first, target in first
+        for T_second, source in second
+        if (found := register_pair(source, target)) is not None and found.believed
+    ]
+    alike = ([b for b in worlds if not are_distinct_poses(a, b)] for a in worlds)
+    agreeing = max(alike, key=len, default=[])
+    if len(agreeing) < max(2, len(worlds) // 2 + 1):
+        raise RegistrationError(reason)
+    T_world_other = median_pose(np.stack(agreeing))
+    _, T_first, T_second = common_poses(tracks[0], tracks[k], fit.time_offset_s)
+    T_a_b = median_pose(se3.inverse(T_first) @ T_world_other @ T_second)
+    return replace(fit, T_a_b=T_a_b, T_world_other=T_world_other)
+
+
+def _views(camera: Camera, track: Track, count: int) -> Iterator[tuple[int, PreparedView]]:
+    """Yield some views along a track, with the rows of their poses."""
+    for p in evenly_spaced(np.arange(len(track.times)), count):
+        row = int(np.searchsorted(camera.recording.timestamps, track.times[p]))
+        frame = camera.image(row)
+        if frame is not None:
+            yield p, camera.surface(frame)
+
+
 def _too_uncertain(fit: HandEye, depth: float) -> str:
     """Return why a pose is too uncertain; empty if it is not."""
     position, rotation = se3.largest_sigmas(fit.covariance).tolist()
@@ -177,13 +236,10 @@ class _JointViews:
             world[k] = replace(tracks[k], poses=fit.T_world_other @ tracks[k].poses)
         camera, rows, views = [], [], []
         for k, track in world.items():
-            for p in evenly_spaced(np.arange(len(track.times)), _VIEWS):
-                row = int(np.searchsorted(cameras[k].recording.timestamps, track.times[p]))
-                frame = cameras[k].image(row)
-                if frame is not None:
-                    camera.append(k)
-                    rows.append(p)
-                    views.append(SampledView.of(cameras[k].surface(frame), _POINTS))
+            for p, view in _views(cameras[k], track, _VIEWS):
+                camera.append(k)
+                rows.append(p)
+                views.append(SampledView.of(view, _POINTS))
         return cls(world, camera, rows, views)
 
     def refined(self) -> dict[int, Track]:

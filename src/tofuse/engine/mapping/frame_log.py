@@ -80,7 +80,7 @@ class FrameSequence:
                 f"frame {frame.index}: timestamp {problem}; motion is predicted by times: pass "
                 "seconds that ascend, and leave out frames that repeat",
                 InputWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
 
     def accept(self, index: int, kind: ViewKind | None = None) -> None:
@@ -188,15 +188,17 @@ class FrameLog:
 
     def check_posed(self) -> None:
         """Raise InputError if no frame has a pose."""
+        if not self.entries:
+            raise InputError("has no frames", where="mapper", remedy="push frames first")
         if not self.posed:
             entries = self.entries
             remedy = "check it with `tofuse inspect`, and the limits of depth and the filters"
             depths = [e.record.mean_depth_m or 0.0 for e in entries]
-            if depths and np.nanmedian(depths) > _FAR_M:
+            if np.nanmedian(depths) > _FAR_M:
                 remedy = f"depth must be in m; here it is {np.nanmedian(depths):.0f} m on average"
             raise InputError(
                 f"none of the {len(entries)} frames has enough valid points for a pose"
-                + (f" (first: {entries[0].record.reason})" if entries else ""),
+                f" (first: {entries[0].record.reason})",
                 where="the recording",
                 remedy=remedy,
             )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import wraps
+from threading import RLock
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +14,7 @@ from numpy.typing import ArrayLike
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.compute import ahead, thread_count, threads, trim_memory
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, signals_as_themselves
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
@@ -36,6 +38,20 @@ from tofuse.engine.views import PreparedView
 
 _UNIT = 1e-3  # tolerance of the length of a unit vector
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def _in_turn(method: Callable[Concatenate[Mapper, P], R]) -> Callable[Concatenate[Mapper, P], R]:
+    """Let threads call a method of a mapper one after another."""
+
+    @wraps(method)
+    def call(mapper: Mapper, /, *args: P.args, **options: P.kwargs) -> R:
+        with mapper._lock, signals_as_themselves():
+            return method(mapper, *args, **options)
+
+    return call
+
 
 class Mapper:
     """Turns frames into a trajectory and a model, online.
@@ -44,6 +60,8 @@ class Mapper:
     >>> for frame in frames:
     ...     T_world_camera = mapper.push(frame)   # None where lost
     >>> result = mapper.finish()
+
+    Several threads may push: they take turns, and a frame that comes too late is an InputError.
 
     Parameters
     ----------
@@ -85,6 +103,7 @@ class Mapper:
         self.config = configured(config)
         self._given = config
         self.seed = seed
+        self._lock = RLock()
         self.threads = threads if threads is not None else thread_count()
         if self.threads > 1:
             ahead.load_in_background()
@@ -110,6 +129,7 @@ class Mapper:
         self._live_poses = LivePoses(self._observations.loops, self.config.optimiser)
         self._component = 0
 
+    @_in_turn
     def push(
         self,
         frame: Frame,
@@ -221,6 +241,7 @@ class Mapper:
         """
         return self._preparation.prepare_ahead(frame, self._tracker)
 
+    @_in_turn
     def skip(self, index: int, timestamp: float, reason: str) -> None:
         """Record that a frame could not be read.
 
@@ -237,6 +258,7 @@ class Mapper:
         self._log.add(FrameRecord(index, timestamp, "skipped", reason), None)
         self._progress.advance(self._log.entries[-1].record)
 
+    @_in_turn
     def interrupt(self, config: Config | None = None) -> None:
         """Begin another recording with the next frame: the motion is not continuous.
 
@@ -290,6 +312,7 @@ class Mapper:
         timestamps = np.array([times[i] for i in graph.ids.tolist()])
         return OnlineMap(graph, timestamps, views, degenerate)
 
+    @_in_turn
     def finish(self) -> Reconstruction:
         """Join components, close loops, optimise, refine, fuse and judge.
 
@@ -299,8 +322,8 @@ class Mapper:
             If no frame has a pose.
         """
         self._check_open()
-        self._finished = True
         self._log.check_posed()
+        self._finished = True
         with self.watch.running():
             with timing("loops"):
                 self._live_poses.finish()

@@ -443,6 +443,8 @@ def rows_in(
 
 def matrix_of(data: object, where: str | Path, remedy: str | None = None) -> Float64:
     """Return the (4, 4) matrix in JSON data; InputError naming `where` if it is anything else."""
+    if data is None:
+        raise InputError("is missing", where=where, remedy=remedy)
     try:
         matrix = np.array(data, float)
     except (TypeError, ValueError, OverflowError) as error:

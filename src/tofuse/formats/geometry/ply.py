@@ -80,6 +80,10 @@ def _parsed(data: bytes) -> GeometryRecord:
     columns: dict[str, _Columns] = {}
     reader = _Ascii(data[body:]) if kind == "ascii" else _Binary(data, body, _FORMATS[kind])
     for element in elements:
+        if element.name == "vertex" and element.has_list:
+            raise InputError(
+                "has vertices with lists", remedy="export it without further attributes"
+            )
         columns[element.name] = reader.element(element)
         if element.name == "face" or ("vertex" in columns and not _has_later(elements, element)):
             break

@@ -32,8 +32,8 @@ from tofuse.formats.poses.trajectory import (
 # Files with the poses in a folder; the first that exists is used.
 NAMES = ("trajectory.txt", "groundtruth.txt", "images.txt", "transforms.json", "trajectory.log")
 _SUPPORTED = "TUM, EuRoC, KITTI, .log, COLMAP's images.txt, transforms.json or .npy"
-# Times in nanoseconds are larger than any in seconds.
-_NANOSECONDS = 1e12
+# Times in nanoseconds are larger than any in seconds, which end in the year 2286, after 10 s.
+_NANOSECONDS = 1e10
 # Digits that always fit into an int64.
 _DIGITS = 18
 # Cameras of OpenGL look along -z, with y up.
@@ -147,7 +147,8 @@ def _reader(rows: _Rows, *, with_commas: bool) -> _Reader:
         return _kitti
     if count >= 10 and not _is_number(first[9]):
         return _colmap
-    in_ns = count >= 8 and _is_number(first[0]) and float(first[0]) > _NANOSECONDS
+    last = rows[-1][1][0]
+    in_ns = count >= 8 and _is_number(last) and float(last) > _NANOSECONDS
     if in_ns and (with_commas or count > 8):
         return _euroc
     if count == 8:
@@ -166,7 +167,7 @@ def _is_number(cell: str) -> bool:
 def _tum(_rows: _Rows, path: Path) -> TimedPoses:
     """TUM's lines. ORB-SLAM3 writes such for EuRoC's recordings, with times in ns."""
     times, poses = read_tum(path)
-    if len(times) and times[0] > _NANOSECONDS:
+    if times.max(initial=0) > _NANOSECONDS:
         times = 1e-9 * times
     return TimedPoses(poses, timestamps=times)
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import POSES_BY, Frame, depth_counts
+from tofuse.engine.frames import POSES_BY, Frame, RangeFrame, depth_counts
 from tofuse.engine.parts import part
 from tofuse.engine.sensor import DepthCorrection
 from tofuse.formats.cameras import camera_file, corrected_depth, read_correction
@@ -109,8 +109,7 @@ class NativeSource(FileSource):
         if self.color:
             path, frame = self.color[index], self.image(index, depth, camera=camera)
             images["color_image"] = self.color_if_readable(
-                index,
-                lambda: pixels.sampled_color(frame, read_color(path), self.description.color, path),
+                index, lambda: self._read_color(path, frame)
             )
         if self.amplitude:
             counts = self._read(self.amplitude, index, "uint16")
@@ -123,6 +122,17 @@ class NativeSource(FileSource):
         return self.image(
             index, depth, color_registered=self.description.color_registered, **images
         )
+
+    def _read_color(self, path: Path, frame: RangeFrame) -> UInt8:
+        """The colour (H, W, 3) of a frame, from its image."""
+        color = read_color(path)
+        if self._color_is_for_display:
+            return pixels.resized(color, self._size, path, same_view=False)
+        return pixels.sampled_color(frame, color, self.description.color, path)
+
+    @property
+    def _color_is_for_display(self) -> bool:
+        return not self.description.color_registered and self.description.color is None
 
     def _depth(self, index: int) -> Float32:
         """Depth (H, W), m."""
@@ -278,9 +288,12 @@ class NativeSource(FileSource):
         remedy = "use the camera.json of these images"
         for channel in (self.files, self.amplitude, self.confidence, self.sigma):
             check_first_size(channel, size, where, remedy)
+        if self._color_is_for_display:  # its size doesn't matter
+            return
         color = self.description.color
         if color is None:
-            remedy += '; or describe its camera by "color" in camera.json'
+            remedy += '; or describe its camera by "color" in camera.json, or state there that it '
+            remedy += 'has none: "color_registered": false'
         else:
             size = (color.camera.width, color.camera.height)
         check_first_size(self.color, size, where, remedy)

@@ -73,13 +73,16 @@ def _occluded(u: Intp, v: Intp, z: Float64) -> Bool:
     return np.asarray(z > nearest[v, u] * (1 + OCCLUSION_FRACTION))
 
 
-def resized(image: UInt8, size: tuple[int, int], where: Path) -> UInt8:
-    """Return an image (H, W, 3) downscaled by area to the `size` (width, height) of depth."""
+def resized(image: UInt8, size: tuple[int, int], where: Path, *, same_view: bool = True) -> UInt8:
+    """Return an image (H, W, 3) downscaled by area to the `size` (width, height) of depth.
+
+    One that does not have the `same_view` as depth may have another aspect ratio.
+    """
     import cv2
 
     height, width = image.shape[:2]
     # With another aspect ratio it has another view than depth.
-    if abs(width * size[1] - height * size[0]) > 0.02 * height * size[0]:
+    if same_view and abs(width * size[1] - height * size[0]) > 0.02 * height * size[0]:
         raise InputError(
             f"is {width} x {height} pixels, depth {size[0]} x {size[1]}: another aspect ratio",
             where=where,
