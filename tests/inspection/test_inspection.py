@@ -19,7 +19,7 @@ from tofuse.apps.inspection.channels import _delay, _log_depth, check_mirrored
 from tofuse.apps.inspection.finding import CODES, Finding
 from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.apps.inspection.planar import Distortion
-from tofuse.apps.inspection.sample import Sample
+from tofuse.apps.inspection.sample import Pair, Sample, prepare
 from tofuse.apps.jobs.running import with_findings
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
@@ -429,6 +429,20 @@ def test_folding_distortion_is_rejected() -> None:
     assert distortion(-0.5, 0.1).folds
     assert not distortion(-0.25, 0.05).folds
     assert not distortion(0.4, -0.2).folds
+
+
+def test_the_image_hardly_moves_around_an_object() -> None:
+    view = prepare(image(1.0))
+    pair = Pair.of(view, view)
+    turn = se3.exp(np.array([0, 0, 0, 0, np.radians(15), 0]))
+    to_object = se3.exp(np.array([0, 0, 1.0, 0, 0, 0]))
+    around = to_object @ turn @ se3.inverse(to_object)
+    shifts = [
+        replace(pair, alignment=replace(pair.alignment, T_world_source=T)).shift
+        for T in (turn, around)
+    ]
+    assert shifts[0] == pytest.approx(np.tan(np.radians(15)) / 0.75, rel=0.15)
+    assert shifts[1] < 0.1
 
 
 def test_camera_motion_is_classified() -> None:

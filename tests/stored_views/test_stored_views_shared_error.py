@@ -15,7 +15,7 @@ from tofuse.engine.refinement.joint_alignment import refine
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views import shared_error
 from tofuse.engine.stored_views.pair_equation_kernels import marginalise_shared_errors
-from tofuse.engine.stored_views.pair_equations import RefineOptions
+from tofuse.engine.stored_views.pair_equations import DirectedPairs, RefineOptions, Round
 from tofuse.engine.stored_views.view_store import SampledView
 from tofuse.engine.views.prepared_view import prepare_view
 
@@ -178,3 +178,18 @@ def test_pixels_are_not_discounted_without_shared_errors_or_albedo():
     views, truth = bent_views(1, 0.01, lit=False)
     some, none = (refine(views, truth, RefineOptions(shared=s)).poses for s in (1.0, 0.0))
     np.testing.assert_array_equal(some, none)
+
+
+def test_a_pair_whose_sums_are_not_finite_says_nothing(pair):
+    source, target, T = pair
+    points = source.points.copy()
+    points[len(points) // 2, 3:6] = np.inf  # the normal of a plane that was fitted to mere noise
+    views = [target, source, replace(source, points=points)]
+    pairs = np.array([(0, 1), (0, 2)])
+    state = DirectedPairs.of(views, pairs, RefineOptions())
+    fixed = np.ones(kernels.ERRORS, np.int64)
+    state.evaluate(np.stack([np.eye(4), T, T]), np.zeros(kernels.ERRORS), fixed, Round(1, 0.0, 0.0))
+    is_noise = (state.source == 2) & (state.target == 0)
+    assert not state.rows[is_noise].any()
+    assert np.isfinite(state.rows).all()
+    assert state.rows[~is_noise].any(1).all()

@@ -204,10 +204,19 @@ class Pair:
         """Distance of the cameras, m."""
         return float(np.linalg.norm(self.alignment.T_world_source[:3, 3]))
 
-    @property
+    @cached_property
     def shift(self) -> float:
-        """Image motion by rotation and translation, as a fraction of the field of view."""
-        return (self.angle + self.distance / self.first.depth) / field_of_view(self.first)
+        """Median motion of the image, as a fraction of its smaller side.
+
+        Around an object the camera moves and turns far, and the image hardly moves.
+        """
+        rays, z = self.second.rays, self.second.z
+        points = np.dstack([rays * z[..., None], z])[z > 0]
+        moved = se3.transform(self.alignment.T_world_source, points)
+        in_front = moved[:, 2] > 0
+        motion = moved[in_front, :2] / moved[in_front, 2:] - rays[z > 0][in_front]
+        size = np.nanmin(np.nanmax(rays, axis=(0, 1)) - np.nanmin(rays, axis=(0, 1)))
+        return float(np.nanmedian(np.linalg.norm(motion, axis=1)) / size)
 
     @property
     def fits(self) -> bool:

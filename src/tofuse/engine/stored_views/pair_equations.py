@@ -240,6 +240,9 @@ class DirectedPairs:
                 )
 
         run_chunks(work, len(targets), -(-len(rows) // _PAIRS_A_CHUNK))
+        # Planes fitted to mere noise can have unbounded coefficients: such pairs say nothing.
+        unknown = ~(np.isfinite(rows).all(1) & np.isfinite(sums).all((1, 2)))
+        rows[unknown], sums[unknown] = 0.0, 0.0
         self.rows, self.sums = np.empty_like(rows), np.empty_like(sums)
         self.rows[order], self.sums[order] = rows, sums
 
