@@ -28,7 +28,7 @@ from tofuse.engine.compute import one_blas_thread, run_chunks
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.geometry import se3
 from tofuse.engine.normal import robust_sigma
-from tofuse.engine.refinement.calibration_check import USUAL
+from tofuse.engine.refinement.calibration_check import TOLERANCES, USUAL
 from tofuse.engine.refinement.camera_response import SECTIONS
 from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.views import residual_kernels
@@ -37,10 +37,9 @@ from tofuse.engine.views import residual_kernels
 _ACROSS, _DOWN = 7, 6
 _ORDERS = np.array([(a, b) for a in range(_ACROSS) for b in range(_DOWN) if a or b])
 _MODES = len(_ORDERS)
-# Errors of the calibration, which are estimated as well: focal length, principal point (two),
-# distortion and range offset, as in `calibration_check`.
-_ERRORS = 5
-_UNKNOWNS = _MODES + _ERRORS
+# Errors of the calibration, which are estimated as well.
+_ERRORS = "focal", "center_x", "center_y", "distortion", "offset"
+_UNKNOWNS = _MODES + len(_ERRORS)
 # Views are compared with the ones this many later, and at most so many pairs in all.
 _LAGS, _MAX_PAIRS = (1, 2, 4, 8), 200
 _PAIRS_A_CHUNK = 8
@@ -134,7 +133,10 @@ def estimate(
         return fit
 
     fit, of_triangulation = fitted(0.0), fitted(2.0)
-    if fit.log_ratio < max(_STRONG, of_triangulation.log_ratio):
+    errors = zip(_ERRORS, fit.coefficients[_MODES:], strict=True)
+    # A wrong calibration is to be corrected first: the pattern would take some of its effects.
+    wrong = any(abs(error) > TOLERANCES[name] for name, error in errors)
+    if wrong or fit.log_ratio < max(_STRONG, of_triangulation.log_ratio):
         return NONE
     return FixedPattern((cosines @ fit.coefficients[:_MODES]).astype(np.float32).reshape(shape))
 
@@ -377,7 +379,7 @@ def _fitted(compared: Sequence[_Compared], coefficients: Float64, inflation: flo
     pattern = np.arange(_MODES)
     c, variance, dispersion = np.zeros(_UNKNOWNS), _FIRST_SIGMA**2, 1.0
     for _ in range(_ITERATIONS):
-        prior = np.append(np.full(_MODES, variance), np.full(_ERRORS, USUAL**2))
+        prior = np.append(np.full(_MODES, variance), np.full(len(_ERRORS), USUAL**2))
         covariance = np.linalg.inv(total / dispersion + np.diag(1 / prior))
         c = -covariance @ gradient / dispersion
         variance = float(c[pattern] @ c[pattern] + np.trace(covariance[:_MODES, :_MODES])) / _MODES
@@ -385,7 +387,7 @@ def _fitted(compared: Sequence[_Compared], coefficients: Float64, inflation: flo
         np.add.at(scores, section, (g + A @ c)[:, pattern])
         scatter = float(scores.var(0, ddof=1).sum()) * SECTIONS
         dispersion = max(scatter / float(np.trace(total[:_MODES, :_MODES])), 1.0)
-    without = np.append(np.zeros(_MODES), np.full(_ERRORS, USUAL**2))
+    without = np.append(np.zeros(_MODES), np.full(len(_ERRORS), USUAL**2))
     with_pattern, none = (
         _log_evidence(total / dispersion, gradient / dispersion, p) for p in (prior, without)
     )
