@@ -63,10 +63,18 @@ def test_large_errors_are_not_taken_for_outliers():
     assert np.sum(found.z * -large) / np.sum(large**2) > 0.6
 
 
-def test_errors_of_triangulation_are_left_alone():
-    truth = path(24)
-    squared = [2 * PATTERN * (corner(T).depth / 3.0) ** 2 for T in truth]
-    assert fixed_pattern.estimate(views(truth, squared), truth, OPTIONS).z is None
+def test_errors_of_triangulation_grow_with_the_squared_depth():
+    truth, depth = path(24), 3.0
+
+    def found(size):
+        errors = [size * PATTERN * (corner(T).depth / depth) ** 2 for T in truth]
+        return fixed_pattern.estimate(views(truth, errors, 3 * NOISE), truth, OPTIONS)
+
+    small = found(0.4)
+    assert small.power == 2
+    at_depth = small.at(np.full(PATTERN.shape, depth, np.float32), small.z)
+    assert np.corrcoef(at_depth.ravel(), -PATTERN.ravel())[0, 1] > 0.8
+    assert found(2.0).z is None  # far above the noise
 
 
 def test_runs_of_many_views_suffice():

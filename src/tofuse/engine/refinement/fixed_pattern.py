@@ -11,7 +11,7 @@ The pattern is a sum of cosines, whose coefficients have one variance, which the
 (empirical Bayes): where there is no pattern, it vanishes. Other errors, such as multipath, differ
 from view to view, and their scatter divides the information.
 
-Errors of triangulation, in the disparity, grow with the squared depth. Where that is likelier they
+Errors of triangulation, in the disparity, grow with the squared depth. Those that exceed the noise
 are left alone: they reach centimetres, and the recorded images would no longer agree.
 """
 
@@ -40,6 +40,9 @@ _MODES = len(_ORDERS)
 # Errors of the calibration, which are estimated as well.
 _ERRORS = "focal", "center_x", "center_y", "distortion", "offset"
 _UNKNOWNS = _MODES + len(_ERRORS)
+# The errors of time of flight are the same at each depth, those of triangulation, in the disparity,
+# grow with its square, and so do some of multipath: powers that are tried.
+_POWERS = 0.0, 2.0
 # Views are compared with the ones this many later, and at most so many pairs in all.
 _LAGS, _MAX_PAIRS = (1, 2, 4, 8), 200
 _PAIRS_A_CHUNK = 8
@@ -66,21 +69,33 @@ class FixedPattern:
     Attributes
     ----------
     z
-        (H, W) m, along the ray, with a mean of about 0; None without strong evidence for any.
+        (H, W) m, along the ray, at `depth`, with a mean of about 0; None without strong evidence
+        for any.
+    depth, power
+        m, and power of the depth relative to this, to which the errors are proportional.
     """
 
     z: Float32 | None
+    depth: float = 1.0
+    power: float = 0.0
 
     def corrected(self, view: SampledView) -> SampledView:
         """Return a view without these errors: its points, and the planes of its target image."""
         if self.z is None:
             return view
         points, target = view.points.copy(), view.target.copy()
-        points[:, :3] *= (1 + self.z.ravel()[_pixels(view)] / points[:, 2])[:, None]
-        shift = (target[..., :2] * view.projection.rays).sum(-1) + target[..., 2]
+        z = points[:, 2]
+        points[:, :3] *= (1 + self.at(z, self.z.ravel()[_pixels(view)]) / z)[:, None]
+        along = (target[..., :2] * view.projection.rays).sum(-1) + target[..., 2]
         distance = target[..., residual_kernels.DISTANCE]
-        distance += np.where(distance != 0, shift * self.z / np.float32(view.target_scale), 0)
+        scale = np.float32(view.target_scale)
+        of_planes = np.divide(distance * scale, along, out=np.zeros_like(along), where=along != 0)
+        distance += np.where(distance != 0, along * self.at(of_planes, self.z) / scale, 0)
         return replace(view, points=points, target=target)
+
+    def at(self, z: Float32, pattern: Float32) -> Float32:
+        """Return what is to be added at depths z, m, to pixels with these values of the pattern."""
+        return np.asarray(pattern * (z / np.float32(self.depth)) ** np.float32(self.power))
 
 
 NONE = FixedPattern(None)
@@ -132,13 +147,15 @@ def estimate(
             fit = _fitted(compared, fit.coefficients, inflation)
         return fit
 
-    fit, of_triangulation = fitted(0.0), fitted(2.0)
+    power, fit = max(((p, fitted(p)) for p in _POWERS), key=lambda item: item[1].log_ratio)
     errors = zip(_ERRORS, fit.coefficients[_MODES:], strict=True)
     # A wrong calibration is to be corrected first: the pattern would take some of its effects.
-    wrong = any(abs(error) > TOLERANCES[name] for name, error in errors)
-    if wrong or fit.log_ratio < max(_STRONG, of_triangulation.log_ratio):
+    if fit.log_ratio < _STRONG or any(abs(error) > TOLERANCES[name] for name, error in errors):
         return NONE
-    return FixedPattern((cosines @ fit.coefficients[:_MODES]).astype(np.float32).reshape(shape))
+    z = (cosines @ fit.coefficients[:_MODES]).astype(np.float32).reshape(shape)
+    if power and z.std() > np.median([view.sigma for view in views]):
+        return NONE
+    return FixedPattern(z, depth, power)
 
 
 def _cosines(shape: tuple[int, ...]) -> Float64:
