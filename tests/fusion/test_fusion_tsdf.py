@@ -309,7 +309,7 @@ def test_builder_keeps_views_within_memory_limit() -> None:
         assert len(advanced) == 60
         assert (spill.spilled_bytes > 0) == (options.memory_mb == 1)
         assert spill.resident_bytes <= options.memory_mb * 500_000
-        assert len(spill) == 60  # corrected copies are dropped
+        assert len(spill) == 60  # views are corrected without copies
         assert len(builder.sketch(posed)) > 500
     for large, small in zip(*models, strict=True):
         for name in ("vertices", "faces", "normals", "color", "sigma", "views"):

@@ -125,11 +125,9 @@ class ModelBuilder:
         mesh = fuse_surface(views, T_world_camera, self._options, advance)
         if len(mesh):
             with timing("meshing"):
-                model = Model(mesh.cloud(), at_most(mesh, self._options.faces))
-        else:
-            clouds = (view.as_cloud() for view in views)
-            model = Model(self._average(clouds, poses, self._range_voxel), mesh)
-        return model
+                return Model(mesh.cloud(), at_most(mesh, self._options.faces))
+        clouds = (view.as_cloud() for view in views)
+        return Model(self._average(clouds, poses, self._range_voxel), mesh)
 
     def sketch(self, poses: Mapping[int, Float64]) -> Cloud:
         """Return a cloud at other poses for display, without normals for images.

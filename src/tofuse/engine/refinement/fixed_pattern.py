@@ -206,19 +206,17 @@ class _Residuals:
     ----------
     residuals
         (N,).
-    by_pose
-        (N, 7) their Jacobian by the right perturbation of T_target_source and the exposure.
-    by_camera
-        (N, UNKNOWNS) that by the coefficients and the errors of the calibration.
+    J
+        (N, 7 + UNKNOWNS) their Jacobian by the right perturbation of T_target_source, exposure,
+        coefficients and errors of the calibration.
     """
 
     residuals: Float64
-    by_pose: Float64
-    by_camera: Float64
+    J: Float64
 
-    def left(self, coefficients: Float64) -> Float64:
-        """Return the residuals that coefficients and errors leave."""
-        return np.asarray(self.residuals + self.by_camera @ coefficients, np.float64)
+    def left(self, step: Float64, coefficients: Float64) -> Float64:
+        """Return the residuals after a step (7,), with these coefficients and errors."""
+        return np.asarray(self.residuals + self.J @ np.append(step, coefficients), np.float64)
 
 
 def _weights(residuals: Float64, inflation: float) -> Float64:
@@ -251,10 +249,8 @@ class _Compared:
         step = self._best_step(coefficients)
         H, g = np.diag(np.append(_PRIOR, np.zeros(_UNKNOWNS))), np.zeros(7 + _UNKNOWNS)
         for term in self.terms:
-            left = term.left(coefficients) + term.by_pose @ step
-            J = np.column_stack([term.by_pose, term.by_camera])
-            wJ = _weights(left, inflation) * J
-            H += J.T @ wJ
+            wJ = _weights(term.left(step, coefficients), inflation) * term.J
+            H += term.J.T @ wJ
             g += term.residuals @ wJ
         coupling = H[:7, 7:]
         eliminated = np.linalg.solve(H[:7, :7], np.column_stack([coupling, g[:7]]))
@@ -265,9 +261,9 @@ class _Compared:
         """Return the step (7,) of the pose and the exposure, without outliers by far."""
         H, g = np.diag(_PRIOR), np.zeros(7)
         for term in self.terms:
-            left = term.left(coefficients)
-            wJ = _weights(left, _INFLATIONS[0]) * term.by_pose
-            H += term.by_pose.T @ wJ
+            left, J = term.left(np.zeros(7), coefficients), term.J[:, :7]
+            wJ = _weights(left, _INFLATIONS[0]) * J
+            H += J.T @ wJ
             g += left @ wJ
         return np.asarray(-np.linalg.solve(H, g), np.float64)
 
@@ -334,7 +330,7 @@ def _terms(
         )
         if exposure:  # the albedo of the target depends on the ray alone
             of_target[:, :_MODES] = of_target[:, -1] = 0.0
-        return _Residuals(r[which], by_pose, by_camera - of_target)
+        return _Residuals(r[which], np.column_stack([by_pose, by_camera - of_target]))
 
     distances = term(seen, (n * q).sum(1) - distance, n, 0.0)
     if not (photometric and source.has_albedo and target.has_albedo):
