@@ -60,6 +60,7 @@ _PRIOR = np.array([1 / _POSE_SIGMA**2] * 6 + [1.0])
 _STRONG = float(np.log(10))
 # Iterations for the variance of the coefficients, from this sigma, m.
 _ITERATIONS, _FIRST_SIGMA = 20, 0.002
+_ZERO = np.zeros(_UNKNOWNS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,32 +138,33 @@ def estimate(
     if len(views) < _MIN_VIEWS or any(view.target.shape[:2] != shape for view in views):
         return NONE
     pairs = _pairs(np.arange(len(views)) if positions is None else positions)
-    cosines = _cosines(shape)
+    compared = _compared(views, pairs, poses, photometric=options.photometric)
+    if not compared:
+        return NONE
     depth = float(np.median([view.depth for view in views]))
+    cosines = _cosines(shape)
 
-    def fitted(power: float) -> _Fit:
-        fit, modes = _Fit(np.zeros(_UNKNOWNS), -np.inf), _Modes(cosines, depth, power)
-        compared = _compared(views, pairs, poses, modes, photometric=options.photometric)
-        for inflation in _INFLATIONS if compared else ():
-            fit = _fitted(compared, fit.coefficients, inflation)
-        return fit
-
-    power, fit = max(((p, fitted(p)) for p in _POWERS), key=lambda item: item[1].log_ratio)
+    # Half of the pairs tell which power is likelier.
+    tried = [_Modes(cosines, depth, power) for power in _POWERS]
+    first = [_fitted(compared[::2], modes, _ZERO, _INFLATIONS[0]) for modes in tried]
+    modes, fit = max(zip(tried, first, strict=True), key=lambda item: item[1].log_ratio)
+    for inflation in _INFLATIONS[1:]:
+        fit = _fitted(compared, modes, fit.coefficients, inflation)
     errors = zip(_ERRORS, fit.coefficients[_MODES:], strict=True)
     # A wrong calibration is to be corrected first: the pattern would take some of its effects.
     if fit.log_ratio < _STRONG or any(abs(error) > TOLERANCES[name] for name, error in errors):
         return NONE
     z = (cosines @ fit.coefficients[:_MODES]).astype(np.float32).reshape(shape)
-    if power and z.std() > np.median([view.sigma for view in views]):
+    if modes.power and z.std() > np.median([view.sigma for view in views]):
         return NONE
-    return FixedPattern(z, depth, power)
+    return FixedPattern(z, depth, modes.power)
 
 
-def _cosines(shape: tuple[int, ...]) -> Float64:
+def _cosines(shape: tuple[int, ...]) -> Float32:
     """Return the modes (H W, MODES) of an image (H, W)."""
     v, u = np.indices(shape).reshape(2, -1)
     phase = np.pi * (np.stack([u, v], 1) + 0.5) / shape[::-1]
-    return np.asarray(np.prod(np.cos(phase[:, None] * _ORDERS), axis=2), np.float64)
+    return np.prod(np.cos(phase[:, None] * _ORDERS), axis=2).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,14 +179,9 @@ class _Modes:
         m, and power of the depth relative to this, to which the changes are proportional.
     """
 
-    cosines: Float64
+    cosines: Float32
     depth: float
     power: float
-
-    def at(self, pixels: Intp, z: Float64) -> Float64:
-        """Return the (N, MODES) changes for points at pixels (N,) and depths (N,), m."""
-        changes = self.cosines[pixels] * ((z / self.depth) ** self.power)[:, None]
-        return np.asarray(changes, np.float64)
 
 
 def _pairs(positions: Intp) -> Intp:
@@ -199,31 +196,66 @@ def _pairs(positions: Intp) -> Intp:
 
 
 @dataclass(frozen=True, eq=False)
-class _Residuals:
+class _Rays:
+    """Rays of one view along which residuals change.
+
+    Attributes
+    ----------
+    pixels, z
+        (N,) of the rays, and depth of the points on them, m.
+    per_z
+        (N,) change of the residual with this depth.
+    """
+
+    pixels: Intp
+    z: Float32
+    per_z: Float32
+
+    def by(self, modes: _Modes) -> Float32:
+        """Return the changes of the residuals by the coefficients of the modes, (N, MODES)."""
+        factor = self.per_z * (self.z / np.float32(modes.depth)) ** np.float32(modes.power)
+        return np.asarray(modes.cosines[self.pixels] * factor[:, None], np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class _Differences:
     """Distances of points from the planes of another view, m, or differences of the log albedo.
 
     Attributes
     ----------
     residuals
         (N,).
-    J
-        (N, 7 + UNKNOWNS) their Jacobian by the right perturbation of T_target_source, exposure,
-        coefficients and errors of the calibration.
+    by_pose
+        (N, 7) their Jacobian by the right perturbation of T_target_source and by the exposure.
+    by_errors
+        (N, ERRORS) by the errors of the calibration.
+    rays
+        Of the source, and of the target if its depth matters.
     """
 
-    residuals: Float64
-    J: Float64
+    residuals: Float32
+    by_pose: Float32
+    by_errors: Float32
+    rays: tuple[_Rays, ...]
 
-    def left(self, step: Float64, coefficients: Float64) -> Float64:
-        """Return the residuals after a step (7,), with these coefficients and errors."""
-        return np.asarray(self.residuals + self.J @ np.append(step, coefficients), np.float64)
+    def rows(self, modes: _Modes) -> Float32:
+        """Return the Jacobian by pose, exposure, coefficients and errors, and the residuals.
+
+        As (N, 7 + UNKNOWNS + 1).
+        """
+        by_modes = self.rays[0].by(modes)
+        for target in self.rays[1:]:
+            by_modes -= target.by(modes)
+        columns = self.by_pose, by_modes, self.by_errors, self.residuals[:, None]
+        return np.concatenate(columns, axis=1)
 
 
-def _weights(residuals: Float64, inflation: float) -> Float64:
-    """Return robust weights (N, 1) of residuals (N,)."""
+def _root_weights(residuals: Float32, inflation: float) -> Float32:
+    """Return the square roots (N, 1) of robust weights of residuals (N,)."""
     sigma = max(robust_sigma(residuals), 1e-6)
     cutoff = projective.ROBUST * np.hypot(sigma, inflation)
-    return np.asarray(tukey.weights((residuals / cutoff) ** 2)[:, None] / sigma**2, np.float64)
+    weights = tukey.weights((residuals.astype(np.float64) / cutoff) ** 2)
+    return np.asarray(np.sqrt(weights)[:, None] / sigma, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,47 +271,46 @@ class _Compared:
     """
 
     target: int
-    terms: tuple[_Residuals, ...]
+    terms: tuple[_Differences, ...]
 
-    def equations(self, coefficients: Float64, inflation: float) -> tuple[Float64, Float64]:
+    def equations(self, modes: _Modes, coefficients: Float64, inflation: float) -> Float64:
         """Return the normal equations of the coefficients and errors, without the pose.
 
-        With robust weights of the residuals that these leave, at the best pose.
+        With robust weights of the residuals that these leave, at the best pose: (UNKNOWNS + 1,
+        UNKNOWNS + 1), of which the last column is the gradient.
         """
-        step = self._best_step(coefficients)
-        H, g = np.diag(np.append(_PRIOR, np.zeros(_UNKNOWNS))), np.zeros(7 + _UNKNOWNS)
-        for term in self.terms:
-            wJ = _weights(term.left(step, coefficients), inflation) * term.J
-            H += term.J.T @ wJ
-            g += term.residuals @ wJ
-        coupling = H[:7, 7:]
-        eliminated = np.linalg.solve(H[:7, :7], np.column_stack([coupling, g[:7]]))
-        without = coupling.T @ eliminated
-        return H[7:, 7:] - without[:, :-1], g[7:] - without[:, -1]
+        terms = [term.rows(modes) for term in self.terms]
+        unknowns = np.concatenate([_best_step(terms, coefficients), coefficients, [1.0]])
+        M = np.zeros((len(unknowns), len(unknowns)))
+        for rows in terms:
+            weighted = _root_weights(rows @ unknowns.astype(np.float32), inflation) * rows
+            M += weighted.T @ weighted
+        pose = M[:7, :7] + np.diag(_PRIOR)
+        return np.asarray(M[7:, 7:] - M[7:, :7] @ np.linalg.solve(pose, M[:7, 7:]), np.float64)
 
-    def _best_step(self, coefficients: Float64) -> Float64:
-        """Return the step (7,) of the pose and the exposure, without outliers by far."""
-        H, g = np.diag(_PRIOR), np.zeros(7)
-        for term in self.terms:
-            left, J = term.left(np.zeros(7), coefficients), term.J[:, :7]
-            wJ = _weights(left, _INFLATIONS[0]) * J
-            H += J.T @ wJ
-            g += left @ wJ
-        return np.asarray(-np.linalg.solve(H, g), np.float64)
+
+def _best_step(terms: Sequence[Float32], coefficients: Float64) -> Float64:
+    """Return the step (7,) of the pose and the exposure, without outliers by far."""
+    M = np.zeros((8, 8))
+    unknowns = np.append(coefficients, 1.0).astype(np.float32)
+    for rows in terms:
+        left = rows[:, 7:] @ unknowns
+        weighted = _root_weights(left, _INFLATIONS[0]) * np.column_stack([rows[:, :7], left])
+        M += weighted.T @ weighted
+    return np.asarray(-np.linalg.solve(M[:7, :7] + np.diag(_PRIOR), M[:7, 7]), np.float64)
 
 
 def _compared(
-    views: Sequence[SampledView], pairs: Intp, poses: Float64, modes: _Modes, *, photometric: bool
+    views: Sequence[SampledView], pairs: Intp, poses: Float64, *, photometric: bool
 ) -> list[_Compared]:
     """Compare pairs (P, 2) of views, without those that are apart."""
     pixels = [_pixels(view) for view in views]
 
     def work(a: int, b: int) -> list[_Compared]:
         result = []
-        for k in range(a, b):
-            t, s = pairs[k].tolist()
-            T = se3.inverse(poses[t]) @ poses[s]
-            terms = _terms(views[s], pixels[s], views[t], T, modes, photometric=photometric)
+        for t, s in pairs[a:b].tolist():
+            T = (se3.inverse(poses[t]) @ poses[s]).astype(np.float32)
+            terms = _terms(views[s], pixels[s], views[t], T, photometric=photometric)
             if terms:
                 result.append(_Compared(t, terms))
         return result
@@ -289,14 +320,8 @@ def _compared(
 
 
 def _terms(
-    source: SampledView,
-    pixels: Intp,
-    target: SampledView,
-    T: Float64,
-    modes: _Modes,
-    *,
-    photometric: bool,
-) -> tuple[_Residuals, ...]:
+    source: SampledView, pixels: Intp, target: SampledView, T: Float32, *, photometric: bool
+) -> tuple[_Differences, ...]:
     """Compare a source's points, which are at these pixels, with the target.
 
     T is (4, 4) T_target_source. Empty if few points see surfaces of the target. A change of the
@@ -304,33 +329,32 @@ def _terms(
     target depends on the ray alone.
     """
     k, (rows, columns) = residual_kernels, target.target.shape[:2]
-    points = source.points.astype(np.float64)
-    q = se3.transform(T, points[:, :3])
-    u, v = np.rint(target.projection.pixels(q[:, :2] / np.maximum(q[:, 2:], 1e-3))).T
+    R, points = T[:3, :3], source.points
+    q = points[:, :3] @ R.T + T[:3, 3]
+    projected = (q[:, :2] / np.maximum(q[:, 2:], 1e-3)).astype(np.float64)
+    u, v = np.rint(target.projection.pixels(projected)).T
     inside = (q[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
     pixel = np.where(inside, v * columns + u, 0).astype(np.intp)
-    image = target.target.reshape(-1, k.PIXEL_SIZE)[pixel].astype(np.float64)
-    n, distance = image[:, :3], image[:, k.DISTANCE] * target.target_scale
-    m, normal = n @ T[:3, :3], points[:, k.NORMAL : k.NORMAL + 3]
-    seen = inside & (distance != 0) & ((m * normal).sum(1) > projective.MIN_COSINE)
+    image = target.target.reshape(-1, k.PIXEL_SIZE)[pixel]
+    n, distance = image[:, :3], image[:, k.DISTANCE] * np.float32(target.target_scale)
+    normal = points[:, k.NORMAL : k.NORMAL + 3]
+    seen = inside & (distance != 0) & ((n @ R * normal).sum(1) > projective.MIN_COSINE)
     # Planes fitted to mere noise can have unbounded coefficients.
     seen &= np.isfinite(image[:, : k.VARIANCE]).all(1) & np.isfinite(normal).all(1)
     if np.count_nonzero(seen) < _MIN_POINTS:
         return ()
 
-    def term(which: Bool, r: Float64, n: Float64, exposure: float) -> _Residuals:
-        p, m = points[which, :3], n[which] @ T[:3, :3]
-        by_pose = np.column_stack([m, np.cross(p, m), np.full(len(p), exposure)])
-        by_camera = _by_camera(m, p, modes.at(pixels[which], p[:, 2]), radial=source.measures_range)
-        of_target = _by_camera(
-            n[which],
-            q[which],
-            modes.at(pixel[which], q[which, 2]),
-            radial=target.measures_range,
-        )
-        if exposure:  # the albedo of the target depends on the ray alone
-            of_target[:, :_MODES] = of_target[:, -1] = 0.0
-        return _Residuals(r[which], np.column_stack([by_pose, by_camera - of_target]))
+    def term(which: Bool, r: Float32, n: Float32, exposure: float) -> _Differences:
+        p, q_, n, m = points[which, :3], q[which], n[which], n[which] @ R
+        by_pose = np.column_stack([m, np.cross(p, m), np.full(len(p), exposure, np.float32)])
+        of_source, by_errors = _by_camera(m, p, radial=source.measures_range)
+        of_target, errors = _by_camera(n, q_, radial=target.measures_range)
+        rays = [_Rays(pixels[which], p[:, 2], of_source)]
+        if exposure:
+            errors[:, -1] = 0.0
+        else:
+            rays.append(_Rays(pixel[which], q_[:, 2], of_target))
+        return _Differences(r[which], by_pose, by_errors - errors, tuple(rays))
 
     distances = term(seen, (n * q).sum(1) - distance, n, 0.0)
     if not (photometric and source.has_albedo and target.has_albedo):
@@ -343,26 +367,26 @@ def _terms(
     if np.count_nonzero(known) < _MIN_POINTS:
         return (distances,)
     gradient = np.column_stack([slope, -along]) / z[:, None]
-    gradient += points[:, k.POINT_ALBEDO_SLOPE : k.POINT_ALBEDO_SLOPE + 3] @ T[:3, :3].T
+    gradient += points[:, k.POINT_ALBEDO_SLOPE : k.POINT_ALBEDO_SLOPE + 3] @ R.T
     difference -= np.median(difference[known])
-    return distances, term(known, difference, 0.5 * gradient, -1.0)
+    return distances, term(known, difference, (0.5 * gradient).astype(np.float32), -1.0)
 
 
-def _by_camera(m: Float64, p: Float64, modes: Float64, *, radial: bool) -> Float64:
+def _by_camera(m: Float32, p: Float32, *, radial: bool) -> tuple[Float32, Float32]:
     """Return how distances (N,) along m (N, 3) of points p (N, 3) change with the camera's errors.
 
-    By the coefficients of the modes (N, MODES) at their pixels, and by the errors of the
-    calibration: (N, UNKNOWNS). See `pair_equation_kernels`.
+    By the depth, (N,), and by the errors of the calibration, (N, ERRORS): see
+    `pair_equation_kernels`.
     """
     along = (m * p).sum(1)
     square = (p * p).sum(1)
     x, y, z = p.T
     # What a lateral displacement adds to the range is not kept, if the camera measures that.
-    kept = along / square if radial else np.zeros(len(p))
+    kept = along / square if radial else np.zeros(len(p), np.float32)
     by_x, by_y = m[:, 0] - x * kept, m[:, 1] - y * kept
     longer = x * by_x + y * by_y
     errors = [longer, z * by_x, z * by_y, (x * x + y * y) / z**2 * longer, along / np.sqrt(square)]
-    return np.column_stack([modes * (along / z)[:, None], *errors])
+    return along / z, np.column_stack(errors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -373,7 +397,9 @@ class _Fit:
     log_ratio: float
 
 
-def _fitted(compared: Sequence[_Compared], coefficients: Float64, inflation: float) -> _Fit:
+def _fitted(
+    compared: Sequence[_Compared], modes: _Modes, coefficients: Float64, inflation: float
+) -> _Fit:
     """Fit coefficients with the robust weights at the last ones.
 
     Their variance maximises the likelihood (expectation maximisation). The information is divided
@@ -381,11 +407,12 @@ def _fitted(compared: Sequence[_Compared], coefficients: Float64, inflation: flo
     that by noise alone: within a section, views share the errors of the scene.
     """
 
-    def work(a: int, b: int) -> list[tuple[Float64, Float64]]:
-        return [pair.equations(coefficients, inflation) for pair in compared[a:b]]
+    def work(a: int, b: int) -> list[Float64]:
+        return [pair.equations(modes, coefficients, inflation) for pair in compared[a:b]]
 
     chunks = run_chunks(work, len(compared), -(-len(compared) // _PAIRS_A_CHUNK))
-    A, g = (np.array(terms) for terms in zip(*(pair for c in chunks for pair in c), strict=True))
+    equations = np.array([pair for chunk in chunks for pair in chunk])
+    A, g = equations[:, :-1, :-1], equations[:, :-1, -1]
     target = np.array([pair.target for pair in compared])
     total, gradient = A.sum(0), g.sum(0)
     section = target * SECTIONS // (int(target.max()) + 1)
