@@ -115,7 +115,7 @@ def test_stop_on_the_way_is_within_two_sigma_of_even_motion(blind) -> None:
     speed = 0.02
     steps = between(blind, [speed] * (N - 1))
     assert [k for k, _ in steps] == list(range(15, 16 + blind))
-    variance = np.cumsum([sigma[0] ** 2 for _, sigma in steps])[:-1]
+    variance = np.cumsum([covariance[0, 0] for _, covariance in steps])[:-1]
     nearer = np.minimum(variance, variance[::-1])
     stopped = speed * np.minimum(np.arange(1, blind + 1), np.arange(blind, 0, -1))
     assert (stopped < 2 * np.sqrt(nearer)).all()
@@ -127,7 +127,7 @@ def test_unobserved_motion_over_a_gap_is_less_certain() -> None:
     (_, short), *_ = between(1, speeds)
     speeds[14:16], spans[14:16] = 0.1, 5.0
     (_, long), *_ = between(1, speeds, spans)
-    assert long[0] > 4 * short[0]
+    assert long[0, 0] > 4**2 * short[0, 0]
 
 
 def test_slide_of_a_registration_counts_as_error() -> None:
@@ -136,7 +136,41 @@ def test_slide_of_a_registration_counts_as_error() -> None:
     speeds[14] += 0.1
     speeds[15] -= 0.1
     (_, slid), *_ = between(1, speeds)
-    assert slid[0] == pytest.approx(np.hypot(even[0], 0.1), rel=0.05)
+    assert slid[0, 0] == pytest.approx(even[0, 0] + 0.1**2, rel=0.1)
+
+
+def turning(rng, angle):
+    """Poses (N, 4, 4) of a camera whose direction scatters by an angle, rad, across x."""
+    motions = 0.02 * np.eye(6)[np.zeros(N - 1, int)]
+    motions[:, 1:3] = 0.02 * angle * rng.standard_normal((N - 1, 2))
+    return path(motions)
+
+
+def test_direction_is_as_certain_as_elsewhere() -> None:
+    """Along the path the camera may have stopped; across it moved as in the measured frames."""
+    bounded = np.ones(N, np.bool_)
+    bounded[15:18] = False
+    unobservable = [NONE if known else SOME for known in bounded]
+    across = {}
+    for angle in (0.1, 0.3):
+        variances = np.zeros((4, 3))
+        for seed in range(50):
+            poses = turning(np.random.default_rng(seed), angle)
+            steps = steps_between_bounded(poses, unobservable, bounded, np.ones(N - 1))
+            variances += [np.diag(covariance)[:3] / 50 for _, covariance in steps]
+        assert 0.5 * 0.02 <= np.sqrt(variances[0, 0]) < 0.02
+        across[angle] = np.sqrt(variances[0, 1:].mean())
+        assert angle * 0.02 < across[angle] < 2.5 * angle * 0.02
+    assert across[0.3] < 0.025
+
+
+def test_direction_is_unknown_if_few_frames_are_measured() -> None:
+    bounded = np.ones(N, np.bool_)
+    bounded[8:24] = False
+    unobservable = [NONE if known else SOME for known in bounded]
+    poses = along([0.02] * (N - 1))
+    (_, covariance), *_ = steps_between_bounded(poses, unobservable, bounded, np.ones(N - 1))
+    assert covariance[1, 1] == pytest.approx(covariance[0, 0], rel=0.01)
 
 
 def test_unobserved_ends_and_cameras_of_unknown_speed_stay_unbounded() -> None:

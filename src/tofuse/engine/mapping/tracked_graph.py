@@ -149,12 +149,12 @@ class TrackedGraph:
         run_of = np.cumsum(bounded, dtype=np.intp)
         contradicted = pose_accuracy.contradicted_runs(graph, indices[~bounded], run_of[~bounded])
         steps = []
-        for k, sigma in found:
+        for k, covariance in found:
             i, j = records[k - 1].index, records[k].index
             run = int(run_of[k]) - int(bounded[k])  # the step after a run belongs to it
             if run not in contradicted and (i, j) not in self.gaps:
-                information = np.diag(np.repeat(sigma, 3) ** -2.0)
                 T_i_j = se3.inverse(poses[k - 1]) @ poses[k]
+                information = np.asarray(np.linalg.inv(covariance), np.float64)
                 steps.append(Measured(i, j, T_i_j, information))
         return tuple(steps)
 

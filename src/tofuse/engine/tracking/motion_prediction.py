@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from tofuse.engine.alignment import projective
 from tofuse.engine.arrays import Bool, Float64, Intp
@@ -29,6 +30,8 @@ _DEFAULT_POWER = 2.0
 # Sigma of the speed of an unobserved motion, as a fraction of the speed before it: 95 % are between
 # standing still and twice as fast.
 _SPEED_SIGMA = 0.5
+# Number of changes of direction of which the rms is known.
+_MIN_TURNS = 15
 
 
 @dataclass(frozen=True)
@@ -139,14 +142,16 @@ def degenerate_runs(unobservable: Sequence[Float64]) -> Intp:
 
 def steps_between_bounded(
     poses: Float64, unobservable: Sequence[Float64], bounded: Bool, spans: Float64
-) -> list[tuple[int, tuple[float, float]]]:
+) -> list[tuple[int, Float64]]:
     """Return how far cameras may be from poses that only those before and after them bound.
 
     Both ends of such a run of frames are measured. In between the speed is unknown, but for its
-    scale: sigma is half of that at the ends, or of the typical one if that is higher. The errors of
-    consecutive steps are alike, so that they grow in proportion to the time from the nearer end.
-    Added are the error of the prediction, which grows at the maximum rate, and the step's
-    difference from an even motion, as a registration may have moved along a degenerate direction.
+    scale: sigma is half of that at the ends, or of the typical one if that is higher. As far as it
+    is that at the ends, it has their direction, and changes across it are those of measured motions
+    (translation and rotation each). The errors of consecutive steps are alike, so that they grow in
+    proportion to the time from the nearer end. Added are the error of the prediction, which grows
+    at the maximum rate, and the step's difference from an even motion, as a registration may have
+    moved along a degenerate direction.
 
     Parameters
     ----------
@@ -161,15 +166,17 @@ def steps_between_bounded(
 
     Returns
     -------
-    For each step of these runs: the frame k that it leads to, from frame k - 1, and sigma of its
-    motion, m and rad. Empty if too few steps are measured to know the speed of the camera.
+    For each step of these runs: the frame k that it leads to, from frame k - 1, and the covariance
+    (6, 6) of its motion, m and rad. Empty if too few steps are measured to know the speed of the
+    camera.
     """
     measured = bounded[1:] & bounded[:-1]
     if 6 * np.count_nonzero(measured) < _MIN_CONSTRAINED:
         return []
     prediction = Prediction.of(poses, unobservable).with_max_growth()
     velocities = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) / spans[:, None]
-    speeds = np.linalg.norm(velocities.reshape(-1, 2, 3), axis=2)
+    velocities = velocities.reshape(-1, 2, 3)
+    speeds = np.linalg.norm(velocities, axis=2)
     typical = np.sqrt((speeds[measured] ** 2).mean(0))
     known = np.flatnonzero(measured)
     steps = []
@@ -181,18 +188,48 @@ def steps_between_bounded(
         n = np.minimum(ends[1:], (ends[-1] - ends[:-1]))  # time from the nearer end
         speed = np.maximum(typical, speeds[[before, after]].max(0))
         growth = n**2 - np.maximum(n - spans[k], 0.0) ** 2
-        share = ((ends[1:] + ends[:-1]) / (2 * ends[-1]))[:, None]
+        share = ((ends[1:] + ends[:-1]) / (2 * ends[-1]))[:, None, None]
         even = (1 - share) * velocities[before] + share * velocities[after]
-        uneven = (velocities[k] - even).reshape(-1, 2, 3) * spans[k, None, None]
-        error = [
-            prediction.error(*np.ceil([a, b]).astype(int)) for a, b in zip(n, spans[k], strict=True)
-        ]
-        variance = (_SPEED_SIGMA * speed) ** 2 * growth[:, None] + np.square(error)
-        sigma = np.sqrt(variance + (uneven**2).sum(2))
-        steps += [
-            (int(row) + 1, (float(m), float(rad))) for row, (m, rad) in zip(k, sigma, strict=True)
-        ]
+        uneven = (velocities[k] - even) * spans[k, None, None]
+        turns = _turns(velocities, measured, typical, int(np.ceil(n.max())))
+        for i, row in enumerate(k.tolist()):
+            error = prediction.error(*np.ceil([n[i], spans[row]]).astype(int))
+            blocks = [
+                growth[i] * _of_speed(even[i, j], speed[j], turns[j])
+                + error[j] ** 2 * np.eye(3)
+                + np.outer(uneven[i, j], uneven[i, j])
+                for j in range(2)
+            ]
+            steps.append((row + 1, block_diag(*blocks)))
     return steps
+
+
+def _turns(velocities: Float64, measured: Bool, typical: Float64, ahead: int) -> Float64:
+    """Return sigma of velocities (N, 2, 3) along the axes across those `ahead` steps before.
+
+    As a fraction of the typical speeds (2,), of translation and rotation; infinite if too few pairs
+    of steps are measured.
+    """
+    first = np.flatnonzero(measured[:-ahead] & measured[ahead:])
+    if len(first) < _MIN_TURNS:
+        return np.full(2, np.inf)
+    before, after = velocities[first], velocities[first + ahead]
+    along = (before * after).sum(2) ** 2 / np.maximum((before**2).sum(2), 1e-30)
+    across = np.maximum((after**2).sum(2) - along, 0.0)
+    return np.asarray(np.sqrt(across.mean(0) / 2) / np.maximum(typical, 1e-12), np.float64)
+
+
+def _of_speed(even: Float64, speed: float, turn: float) -> Float64:
+    """Return the covariance (3, 3) of an unobserved velocity of some speed about an even one (3,).
+
+    `turn` is sigma across the even one, as a fraction of the speed; what the even one lacks of the
+    speed may have any direction.
+    """
+    known = float(np.linalg.norm(even))
+    rest = max(1 - known / max(speed, 1e-12), 0.0)
+    across = min(_SPEED_SIGMA, float(np.hypot(turn, _SPEED_SIGMA * rest))) ** 2
+    along = (_SPEED_SIGMA**2 - across) * np.outer(even, even) / max(known, 1e-12) ** 2
+    return np.asarray(speed**2 * (across * np.eye(3) + along), np.float64)
 
 
 def with_prediction(
