@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from aligned_surfaces import OPTIONS, away, path
 from corner_views import CAMERA, SHARP, corner
+from refined_submaps import refined
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement import fixed_pattern
 from tofuse.engine.refinement.joint_alignment import refine
+from tofuse.engine.refinement.refinement import Joint
 from tofuse.engine.stored_views.view_store import SampledView
 from tofuse.engine.views.prepared_view import prepare_view
 
@@ -53,6 +56,23 @@ def test_pattern_is_found_from_poses_that_followed_it():
     as_they_are = refine(seen, bent, OPTIONS).poses
     without = refine([found.corrected(view) for view in seen], bent, OPTIONS).poses
     assert away(without, truth) < 0.5 * away(as_they_are, truth)
+
+
+@pytest.mark.parametrize("submap", [300, 10])
+def test_wrong_calibration_is_corrected_before_a_pattern(monkeypatch, submap):
+    """Pair by pair a pattern may explain it better; the drift over many views tells."""
+    some = fixed_pattern.FixedPattern(np.full(PATTERN.shape, 1e-4, np.float32))
+    monkeypatch.setattr(fixed_pattern, "estimate", lambda *_: some)
+    truth = path(12)
+
+    def found(focal: float) -> fixed_pattern.FixedPattern:
+        camera = replace(CAMERA, fx=focal * CAMERA.fx, fy=focal * CAMERA.fy)
+        frames = [replace(corner(T), index=k, camera=camera) for k, T in enumerate(truth)]
+        seen = [prepare_view(frame, SHARP) for frame in frames]
+        return refined(Joint(submap=submap), seen, truth).pattern
+
+    assert found(1.0) is some
+    assert found(1.05).z is None
 
 
 def test_large_errors_are_not_taken_for_outliers():

@@ -37,12 +37,13 @@ from tofuse.engine.refinement.joint_alignment import (
     RefinedViews,
     align_views,
     mean_support,
+    overlapping,
 )
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, loop_gap, thinned
 from tofuse.engine.refinement.range_change import RangeChange, likely_change, range_change
 from tofuse.engine.refinement.split_half import rms_motion
+from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
-from tofuse.engine.stored_views import pair_equations
 
 # Multipath and mixed pixels look like an error of the focal length of up to a percent; cameras are
 # calibrated to better than that. Makers specify depth offsets of up to a centimetre.
@@ -226,6 +227,25 @@ def check_calibration(aligned: RefinedViews) -> CalibrationCheck:
     if not first.is_promising:
         return _check_by_loop(aligned, without_error)
     return _check_promising(aligned, _Estimator(aligned, linearised, first), without_error)
+
+
+def is_wrong(
+    views: Sequence[SampledView],
+    poses: Float64,
+    options: pair_equations.RefineOptions,
+    priors: Priors,
+) -> bool:
+    """Whether views show at poses (N, 4, 4), before any refinement, that the calibration is wrong.
+
+    That is by one error for certain. The parameters are those of `refine`.
+    """
+    views, pairs, options = thinned(views, overlapping(views, poses, options), options)
+    if len(views) < _MIN_VIEWS or not len(pairs):
+        return False
+    estimate = _Estimate.of(Linearised.of(views, poses, pairs, options, priors))
+    estimates = estimate.by_name
+    errors = {name: estimates[name][0] for name in estimates if name == estimate.unusual}
+    return CalibrationCheck(errors=errors, estimates=estimates).certain
 
 
 @dataclass(frozen=True, eq=False)

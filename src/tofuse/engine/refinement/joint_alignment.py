@@ -301,9 +301,9 @@ def align_views(
     def compared(
         poses: Float64, scales: pair_equations.KnownScales | None
     ) -> tuple[pair_equations.DirectedPairs, sparse.PairSystem]:
-        overlapping = _overlapping(views, poses, options, bodies) if pairs is None else pairs
-        known = None if scales is None else scales.of(overlapping)
-        state = pair_equations.DirectedPairs.of(views, overlapping, options, known)
+        of_overlap = overlapping(views, poses, options, bodies) if pairs is None else pairs
+        known = None if scales is None else scales.of(of_overlap)
+        state = pair_equations.DirectedPairs.of(views, of_overlap, options, known)
         return state, _system(state, priors, bodies)
 
     state, system = compared(poses, scales)
@@ -432,11 +432,11 @@ def spread_evenly(pairs: Intp, neighbours: int) -> Intp:
     return pairs[np.concatenate(keep)]
 
 
-def _overlapping(
+def overlapping(
     views: Sequence[SampledView],
     poses: Float64,
     options: pair_equations.RefineOptions,
-    bodies: Bodies | None,
+    bodies: Bodies | None = None,
 ) -> Intp:
     """Return the (M, 2) pairs of overlapping views, of different bodies if there are any."""
     pairs = overlaps(views, poses, options.overlap)[0]

@@ -14,7 +14,7 @@ from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import Measured, PoseGraph, external_sensors
 from tofuse.engine.parts import part
-from tofuse.engine.refinement import fixed_pattern
+from tofuse.engine.refinement import calibration_check, fixed_pattern
 from tofuse.engine.refinement.calibration_check import (
     CalibrationCheck,
     check_calibration,
@@ -281,7 +281,7 @@ class _Joint(Refiner):
         views = [self._sampled(p) for p in posed]
         priors = _priors([p.index for p in posed], sensors)
         alignment = self._options.alignment
-        pattern = fixed_pattern.estimate(views, poses, alignment)
+        pattern = self._pattern(views, poses, priors)
         # In place: all views twice would be the most memory of a run.
         for k, view in enumerate(views):
             views[k] = pattern.corrected(view)
@@ -295,7 +295,8 @@ class _Joint(Refiner):
         ids, alignment = [p.index for p in posed], self._options.alignment
         some = fixed_pattern.runs(len(posed))
         sampled = [self._sampled(posed[k]) for k in some]
-        pattern = fixed_pattern.estimate(sampled, poses[some], alignment, some)
+        priors = _priors([ids[k] for k in some], sensors)
+        pattern = self._pattern(sampled, poses[some], priors, some)
         del sampled
         refined, evaluated = refine_submaps(
             [self._coarse(p) for p in posed],
@@ -308,6 +309,24 @@ class _Joint(Refiner):
             self._error_indices,
         )
         return refined, evaluated, pattern
+
+    def _pattern(
+        self,
+        views: Sequence[SampledView],
+        poses: Float64,
+        priors: Priors,
+        positions: Intp | None = None,
+    ) -> fixed_pattern.FixedPattern:
+        """Estimate the fixed pattern, unless the calibration is wrong, which is corrected first.
+
+        Between two views a pattern may explain a wrong focal length better than any focal length
+        does, as what tells these apart is the drift over many views. See `fixed_pattern.estimate`.
+        """
+        options = self._options.alignment
+        found = fixed_pattern.estimate(views, poses, options, positions)
+        if found.z is not None and calibration_check.is_wrong(views, poses, options, priors):
+            return fixed_pattern.NONE
+        return found
 
     def _evaluate(self, submap: RefinedViews) -> _Evaluation:
         """Evaluate a submap while its views are in memory."""
