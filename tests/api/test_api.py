@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 import shutil
@@ -512,3 +513,28 @@ def test_result_is_saved_after_recording_is_deleted(arrays, tmp_path) -> None:
     shutil.rmtree(tmp_path / "rec")
     found.save(tmp_path / "out")
     assert (tmp_path / "out/report.html").stat().st_size > 10_000
+
+
+class Interrupted:
+    """An argument that can't be looked at: a signal arrives in compiled code."""
+
+    @property
+    def __class__(self) -> type:
+        error = SystemError("returned a result with an exception set")
+        error.__cause__ = KeyboardInterrupt()
+        raise error
+
+    def __getattr__(self, name: str) -> object:
+        return self.__class__
+
+    __fspath__ = __len__ = __iter__ = __array__ = lambda self: self.__class__
+
+
+@pytest.mark.parametrize(
+    "name", [n for n in tofuse.__all__ if inspect.isfunction(getattr(tofuse, n))]
+)
+def test_interruption_in_compiled_code_is_raised_as_itself(name) -> None:
+    function = getattr(tofuse, name)
+    needed = [p for p in inspect.signature(function).parameters.values() if p.default is p.empty]
+    with pytest.raises(KeyboardInterrupt):
+        function(*[Interrupted()] * max(1, len(needed)))

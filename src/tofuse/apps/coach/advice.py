@@ -8,7 +8,7 @@ import numpy as np
 
 from tofuse.apps.certainty import Known
 from tofuse.engine.arrays import Float64
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, signals_as_themselves
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import Mapper
@@ -70,6 +70,7 @@ class Advice:
         return self.bound_m - self.expected_m if np.isfinite(self.bound_m) else 0.0
 
 
+@signals_as_themselves()
 def advise(source: Mapper | Reconstruction) -> Advice | None:
     """Say where to look or walk next so that the bound on the errors of the poses falls.
 

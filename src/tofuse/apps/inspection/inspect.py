@@ -17,7 +17,7 @@ from tofuse.apps.inspection.sample import Sample
 from tofuse.apps.inspection.values import depths_of, valid_fraction
 from tofuse.engine.arrays import Float32
 from tofuse.engine.cameras import Pinhole, RayTable
-from tofuse.engine.errors import InputError, shown
+from tofuse.engine.errors import InputError, shown, signals_as_themselves
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.noise import family_of
 from tofuse.engine.quantities import count, percent
@@ -102,6 +102,7 @@ class Inspection:
         }
 
 
+@signals_as_themselves()
 def inspect_recording(
     recording: Recording | str | Path, *, turning: bool = False, quick: bool = False
 ) -> Inspection:

@@ -13,7 +13,7 @@ from tofuse.apps.inspection import difference
 from tofuse.apps.results import folders, run_json
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, signals_as_themselves
 from tofuse.engine.frames import Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number
@@ -70,6 +70,7 @@ class Evaluation:
         )
 
 
+@signals_as_themselves()
 def evaluate(
     estimate: Poses,
     reference: Poses,

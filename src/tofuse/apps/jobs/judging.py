@@ -28,7 +28,7 @@ from tofuse.apps.results import folders, run_json, stated_accuracy, write_result
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.compute import threads as use_threads
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, signals_as_themselves
 from tofuse.engine.frames import Frame, Recording, Source, evenly_spaced, frame_ranges
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import (
@@ -163,6 +163,7 @@ def _dict(figures: Any) -> dict[str, Any] | None:
     return None if figures is None else figures.to_dict()
 
 
+@signals_as_themselves()
 def judge(
     recording: Recording | str | Path,
     trajectory: str | Path | Float64 | Reconstruction,

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.cameras import Camera, Pinhole, RayTable, pinhole_values
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, signals_as_themselves
 from tofuse.engine.frames.depth_counts import is_marked_invalid
 from tofuse.engine.frames.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
@@ -26,6 +26,7 @@ _MILLIMETRES = 1e-3
 _MAX_MEDIAN_M = 200.0
 
 
+@signals_as_themselves()
 def from_arrays(
     depth: ArrayLike | Sequence[ArrayLike],
     camera: Camera | ArrayLike,

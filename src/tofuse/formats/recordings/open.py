@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.errors import InputError, UnreadableFrameError, signals_as_themselves
 from tofuse.engine.frames import NOISE_MODEL, CloudFrame, Frame, RangeFrame, Recording, Source
 from tofuse.engine.parts import check_number, discover, name_of, registered
 from tofuse.formats.cameras import read_noise
@@ -65,6 +65,7 @@ def readers() -> dict[str, Reader]:
     return {name: cls() for name, cls in registered("reader").items()}
 
 
+@signals_as_themselves()
 def open_recording(
     *paths: str | Path,
     format: str | None = None,  # noqa: A002
