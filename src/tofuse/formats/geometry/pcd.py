@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.formats.files import atomic, reading
+from tofuse.formats.files import atomic, reading, tables
 from tofuse.formats.geometry.ply import stacked
 
 MAX_POINTS = 1 << 28
@@ -200,7 +200,8 @@ def _compressed(body: memoryview, header: _Header) -> list[NDArray[Any]]:
 
 
 def _ascii(body: memoryview, header: _Header) -> list[NDArray[Any]]:
-    lines = [line for line in bytes(body).decode("latin-1").splitlines() if line.strip()]
+    text = tables.plain_nan(bytes(body).decode("latin-1"))
+    lines = [line for line in text.splitlines() if line.strip()]
     if len(lines) < header.points:
         raise _truncated(header)
     total = sum(header.counts)

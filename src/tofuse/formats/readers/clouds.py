@@ -121,7 +121,7 @@ def xyz_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
 
 def _has_head(text: str) -> bool:
     """Whether the first line is a number of points, or names of columns."""
-    cells = text.split("\n", 1)[0].replace(",", " ").replace(";", " ").split()
+    cells = tables.plain_nan(text.split("\n", 1)[0]).replace(",", " ").replace(";", " ").split()
     with suppress(IndexError, ValueError):
         float(cells[0])
         return len(cells) == 1

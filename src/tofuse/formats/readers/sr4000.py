@@ -13,7 +13,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.formats.files import reading
+from tofuse.formats.files import reading, tables
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, pixels
 
 FRAME_RATE_HZ = 32.0
@@ -140,7 +140,7 @@ def _time_stamp(path: Path) -> float:
 def _read_blocks(path: Path) -> dict[str, Float64]:
     """Return the (H, W) blocks of a file by short name."""
     blocks: dict[str, Float64] = {}
-    for section in reading.read_text(path).split("%")[1:]:
+    for section in tables.plain_nan(reading.read_text(path)).split("%")[1:]:
         title, _, body = section.partition("\n")
         name = _BLOCKS.get(title.strip().lower())
         if name is None:
