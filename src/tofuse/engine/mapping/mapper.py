@@ -361,7 +361,7 @@ class Mapper:
             if isinstance(frame, CloudFrame):
                 self.config = configured(self._given, kind)
                 self._shift = frame.shift
-                self._up = np.array([0.0, 0.0, 1.0]) if frame.z_is_up else None
+                self._up = frame.likely_up
                 self._prior_loops = tuple(p.about(-self._shift) for p in self._prior_loops)
                 self._start_method()
             check_views(self.config, kind)

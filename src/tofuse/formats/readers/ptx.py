@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -72,7 +73,11 @@ class _Scan:
             color = np.nan_to_num(table[:, 4:]).clip(0, 255).astype(np.uint8)
         scalars = {"intensity": cloud_files.to_float32(table[:, 3])}
         cloud = GeometryRecord(points, color=color, scalars=scalars)
-        return cloud_files.cloud_frame(index, timestamp, cloud)
+        pose = None
+        with suppress(InputError):  # reported when the file is opened
+            pose = self.pose()
+        up = cloud_files.up_in_scan(pose)
+        return cloud_files.cloud_frame(index, timestamp, cloud, up=up)
 
 
 def _scans(path: Path) -> list[_Scan]:
