@@ -223,7 +223,7 @@ def test_no_frames_and_no_usable_frames_are_refused(frames) -> None:
         Mapper().finish()
     mapper = Mapper()
     assert mapper.push(blank(frames[0])) is None
-    with pytest.raises(InputError, match=r"none of the 1 frames has enough valid points.*0 valid"):
+    with pytest.raises(InputError, match=r"has 1 frame, none with enough valid points.*0 valid"):
         mapper.finish()
 
 

@@ -34,6 +34,7 @@ from tofuse.apps.results import (
     run_json,
     write_result,
 )
+from tofuse.engine import quantities
 from tofuse.engine.errors import InputError, signals_as_themselves
 from tofuse.engine.frames import Frame, Recording
 from tofuse.engine.geometry import se3
@@ -368,7 +369,7 @@ def reconstruct(
     """
     if not isinstance(recording, Recording):
         raise InputError(
-            f"is a {type(recording).__name__}, not a recording",
+            f"is {quantities.one(type(recording).__name__)}, not a recording",
             where="recording",
             remedy="pass tofuse.open(path), or tofuse.from_arrays(depth, K)",
         )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.apps.certainty import Known
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError, signals_as_themselves
 from tofuse.engine.frames import evenly_spaced
@@ -96,7 +97,7 @@ def advise(source: Mapper | Reconstruction) -> Advice | None:
         return advise_on(source.so_far())
     if not isinstance(source, Reconstruction):
         raise InputError(
-            f"is a {type(source).__name__}, neither a mapper nor a result",
+            f"is {quantities.one(type(source).__name__)}, neither a mapper nor a result",
             where="source",
             remedy="pass a tofuse.Mapper, or a result of tofuse.reconstruct or tofuse.load",
         )

@@ -18,6 +18,7 @@ from tofuse._version import __version__
 from tofuse.apps.jobs.sessions import sessions_of, with_given_poses
 from tofuse.apps.pairs import PairOptions, pair_words, register_files
 from tofuse.apps.results import folders, run_json
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Camera
 from tofuse.engine.compute import threads
@@ -165,7 +166,7 @@ class ResultMap:
         if not isinstance(frame, RangeFrame):
             kind = "cloud" if isinstance(frame, CloudFrame) else type(frame).__name__
             raise InputError(
-                f"is a {kind}, not an image of a camera",
+                f"is {quantities.one(kind)}, not an image of a camera",
                 where="frame",
                 remedy="pass a frame of tofuse.open or tofuse.from_arrays; register a cloud with "
                 "the points of the map: tofuse.register",

@@ -14,6 +14,7 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.cameras import Camera, depth_conversion, unknown_rays
@@ -109,7 +110,7 @@ class RangeFrame:
         where = f"frame {self.index}"
         if not isinstance(self.camera, Camera):
             raise InputError(
-                f"is a {type(self.camera).__name__}, not a camera",
+                f"is {quantities.one(type(self.camera).__name__)}, not a camera",
                 where=f"{where}: camera",
                 remedy="pass a camera, such as tofuse.Pinhole",
             )

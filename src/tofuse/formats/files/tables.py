@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.formats.files.atomic import write_text
@@ -122,7 +123,8 @@ def read_columns(path: str | Path) -> dict[str, Float64]:
     for k, row in enumerate(rows[1:]):
         if len(row) != len(names):
             raise InputError(
-                f"has {len(row)} cells in row {k + 1} and {len(names)} column names",
+                f"has {quantities.count(len(row), 'cell')} in row {k + 1} "
+                f"and {len(names)} column names",
                 where=path,
                 remedy="add a cell for each column to each row",
             )

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord
@@ -208,7 +209,7 @@ def _ascii(body: memoryview, header: _Header) -> list[NDArray[Any]]:
     try:
         table = np.loadtxt(lines[: header.points], ndmin=2, comments=None)
         if header.points and table.shape[1] != total:
-            raise ValueError(f"{table.shape[1]} numbers per row, not {total}")
+            raise ValueError(f"{quantities.count(table.shape[1], 'number')} per row, not {total}")
     except (ValueError, OverflowError) as error:
         reason = str(error).split("; use")[0]
         raise InputError(f"contains damaged points ({reason})") from error

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float32, Int32, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord
@@ -252,7 +253,9 @@ class _Ascii:
             width = len(element.properties)
             table = np.loadtxt(lines, ndmin=2) if lines else np.zeros((0, width))
             if table.shape[1] < width:
-                raise ValueError(f"{table.shape[1]} numbers per row, not {width}")
+                raise ValueError(
+                    f"{quantities.count(table.shape[1], 'number')} per row, not {width}"
+                )
             with np.errstate(invalid="ignore", over="ignore"):
                 return {
                     p.name: table[:, k].astype(p.dtype) for k, p in enumerate(element.properties)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame
@@ -63,7 +64,8 @@ class _Scan:
         table = tables.parse_numbers(text, self.file)
         if len(table) != self.count or table.shape[1] not in (4, 7):
             raise InputError(
-                f"has {len(table)} lines of {table.shape[1]} numbers, not {self.count} of 4 or 7",
+                f"has {quantities.count(len(table), 'line')} of {table.shape[1]} numbers, "
+                f"not {self.count} of 4 or 7",
                 where=self.file,
                 remedy="copy or export the file again",
             )

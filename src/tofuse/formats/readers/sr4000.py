@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
@@ -90,7 +91,9 @@ class Sr4000Source(FileSource):
             self.timestamps = np.arange(len(times)) / FRAME_RATE_HZ
             return
         if missing:
-            self.warnings.append(f"{missing} frames have no timestamp: interpolated")
+            self.warnings.append(
+                f"{quantities.count(missing, 'frame')} without a timestamp: interpolated"
+            )
         times = inputs.interpolated(times)
         # Frames stay in sequence where the camera's counter restarts.
         step = np.diff(times, prepend=times[0])

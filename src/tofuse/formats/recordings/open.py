@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.errors import InputError, UnreadableFrameError, signals_as_themselves
 from tofuse.engine.frames import NOISE_MODEL, CloudFrame, Frame, RangeFrame, Recording, Source
@@ -590,7 +591,7 @@ def open_view(
     count = len(recording)
     if index is None and count > 1:
         raise InputError(
-            f"contains {count} frames",
+            f"contains {quantities.count(count, 'frame')}",
             where=name,
             remedy=f"choose one: {name}#0 to {name}#{count - 1}",
         )
