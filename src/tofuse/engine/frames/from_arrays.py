@@ -14,7 +14,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.cameras import Camera, Pinhole, RayTable, pinhole_values
 from tofuse.engine.errors import InputError, signals_as_themselves
-from tofuse.engine.frames.depth_counts import is_marked_invalid
+from tofuse.engine.frames.depth_counts import check_sign, is_marked_invalid
 from tofuse.engine.frames.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
@@ -200,7 +200,9 @@ def _to_metres(
 
     def to_metres(image: NDArray[Any]) -> Float64:
         metres = image.astype(np.float64) * scale
-        return np.where(is_marked_invalid(image), 0.0, metres)
+        metres[is_marked_invalid(image)] = 0
+        check_sign(image, "depth")
+        return metres
 
     return to_metres
 
