@@ -615,7 +615,7 @@ def poses_for(recording: Recording, trajectory: str | Path | Float64 | Reconstru
     Raises
     ------
     InputError
-        If fewer than two frames have a pose, or an array has the wrong shape.
+        If there are fewer than two frames with a pose, or an array has the wrong shape.
     """
     where = "trajectory"
     if isinstance(trajectory, str | Path):
@@ -627,6 +627,12 @@ def poses_for(recording: Recording, trajectory: str | Path | Float64 | Reconstru
         poses = timed.of_frames(recording.timestamps, recording.indices)
     else:
         poses = se3.check_poses(trajectory, where=where, count=len(recording))
+    if len(recording) == 1:
+        raise InputError(
+            "has a single frame, whose pose nothing contradicts",
+            where=recording.path,
+            remedy="pass a recording of several",
+        )
     n_posed = int(np.isfinite(poses).all((1, 2)).sum())
     if n_posed < 2:
         raise InputError(
