@@ -116,6 +116,18 @@ def test_flat_wall_without_albedo_constrains_three_directions(wall):
     assert np.degrees(np.linalg.norm(tilt)) < 0.05
 
 
+def test_views_of_unequal_noise_constrain_each_other(room) -> None:
+    """Errors common to both views count by the noise of both, as the measurements do."""
+    sigma = np.full_like(room.frames[1].depth, 0.05)
+    noisy = prepare_view(replace(room.frames[1], sigma_image=sigma), SurfaceOptions())
+    true = se3.inverse(room.poses[0]) @ room.poses[1]
+    for source, target, T in (
+        (noisy, room.views[0], true),
+        (room.views[0], noisy, se3.inverse(true)),
+    ):
+        assert not len(align(source, [Target(target)], T, GEOMETRY).unobservable)
+
+
 def test_corridor_does_not_constrain_its_axis():
     pair = Pair("corridor", 0, 6, texture=False)
     found = align(pair.views[1], [pair.target], np.eye(4), GEOMETRY)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 import shutil
@@ -383,6 +384,14 @@ def test_masked_pixels_have_no_value(arrays) -> None:
     assert not frame.amplitude_image[:, ::2].any()
 
 
+def test_negative_depth_is_refused_unless_it_marks_pixels(arrays) -> None:
+    depth, K, _ = arrays
+    with pytest.raises(InputError, match="depth: holds negative depth only; negate it"):
+        tofuse.from_arrays(-depth, K)
+    covered = np.full_like(depth[:1], -1)
+    assert tofuse.from_arrays(np.concatenate([depth, covered]), K)[6].depth.max() == 0
+
+
 def test_negative_amplitude_is_none(arrays) -> None:
     amplitude = np.full(arrays[0].shape, 100.0)
     amplitude[:, :30] = -5
@@ -409,23 +418,23 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: tofuse.load(None), "folder: "),
         (lambda: result.save(None), "folder: "),
         (lambda: result.mesh.save(None), r"path: is a NoneType.*ends in one of \.glb"),
-        (lambda: result.cloud.save(3), r"path: is a int.*ends in one of \.ply"),
+        (lambda: result.cloud.save(3), r"path: is an int.*ends in one of \.ply"),
         (lambda: tofuse.merge([result, result]), r"results: is a Result.*save\(folder\)"),
         (lambda: tofuse.merge("result"), "results: is not several paths"),
         (lambda: tofuse.merge(None), "results: is not several paths"),
         (lambda: tofuse.merge([], tolerance_m="x"), "tolerance_m: "),
         (lambda: tofuse.compare(None, result), "is a NoneType, not a path; pass a result"),
         (lambda: result.save("a\0b"), r"folder: is 'a\\x00b', not a path"),
-        (lambda: result.locate(arrays[0][0]), "frame: is a ndarray, not an image"),
+        (lambda: result.locate(arrays[0][0]), "frame: is an ndarray, not an image"),
         (lambda: result.evaluate(arrays[2], reference_error_m=-1), "reference_error_m: is -1"),
         (lambda: tofuse.judge(recording, arrays[2], tolerance_m=-1), "tolerance_m: is -1"),
-        (lambda: tofuse.judge(arrays[0], arrays[2]), "path: is a ndarray"),
+        (lambda: tofuse.judge(arrays[0], arrays[2]), "path: is an ndarray"),
         (lambda: tofuse.judge(tmp_path, arrays[2]), "is an empty folder"),
         (lambda: tofuse.judge(recording, arrays[2], threads=0), "threads: is 0"),
         (lambda: tofuse.reconstruct(recording, threads=0), "threads: is 0"),
         (lambda: tofuse.reconstruct(recording, seed=-1), "seed: is -1"),
         (lambda: tofuse.register(recording[0], recording[1], seed=1.5), "seed: is 1.5"),
-        (lambda: tofuse.Mapper().push(arrays[0][0]), "frame: is a ndarray"),
+        (lambda: tofuse.Mapper().push(arrays[0][0]), "frame: is an ndarray"),
         (lambda: tofuse.Mapper([]), "config: is a list"),
         (lambda: tofuse.Mapper(progress=True), "progress: is True"),
         (lambda: tofuse.reconstruct(recording, None), "config: is a NoneType"),
@@ -512,3 +521,28 @@ def test_result_is_saved_after_recording_is_deleted(arrays, tmp_path) -> None:
     shutil.rmtree(tmp_path / "rec")
     found.save(tmp_path / "out")
     assert (tmp_path / "out/report.html").stat().st_size > 10_000
+
+
+class Interrupted:
+    """An argument that can't be looked at: a signal arrives in compiled code."""
+
+    @property
+    def __class__(self) -> type:
+        error = SystemError("returned a result with an exception set")
+        error.__cause__ = KeyboardInterrupt()
+        raise error
+
+    def __getattr__(self, name: str) -> object:
+        return self.__class__
+
+    __fspath__ = __len__ = __iter__ = __array__ = lambda self: self.__class__
+
+
+@pytest.mark.parametrize(
+    "name", [n for n in tofuse.__all__ if inspect.isfunction(getattr(tofuse, n))]
+)
+def test_interruption_in_compiled_code_is_raised_as_itself(name) -> None:
+    function = getattr(tofuse, name)
+    needed = [p for p in inspect.signature(function).parameters.values() if p.default is p.empty]
+    with pytest.raises(KeyboardInterrupt):
+        function(*[Interrupted()] * max(1, len(needed)))

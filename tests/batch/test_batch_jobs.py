@@ -64,7 +64,7 @@ def test_table_sets_options_per_job(recordings: Path) -> None:
         ("list.csv", "", "lists no recording"),
         ("list.csv", "path\na\n", "row 1: names no recording"),
         ("list.csv", "recording,recording\na,b\n", "name each column once"),
-        ("list.csv", "recording,every\na\n", "row 1: has 1 cells, but there are 2 columns"),
+        ("list.csv", "recording,every\na\n", "row 1: has 1 cell, but there are 2 columns"),
         ("list.csv", 'recording\n"a\n', "is not a table"),
         ("list.csv", "recording,evry\na,2\n", "for a table; did you mean every?"),
         ("list.csv", "recording,out\na,b\n", "row 1: out is not an option"),

@@ -71,7 +71,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
     "all images truncated": (truncate_all, ("none of 4 frames", "000000.png", "cut off")),
     "broken json": (lambda r: (r / "camera.json").write_text('{"a": '), ("camera.json", "JSON")),
     "json bytes": (lambda r: (r / "camera.json").write_bytes(b"\xff\xfe\0"), ("camera.json",)),
-    "all frames invalid": (blank_all, ("none of the 4 frames", "0 valid points")),
+    "all frames invalid": (blank_all, ("has 4 frames, none with", "0 valid points")),
     "nan": (lambda r: camera(r, fx=float("nan")), ("camera.json", "fx", "nan")),
     "fewer amplitudes": (lambda r: (r / "amplitude/000002.png").unlink(), ("amplitude", "3", "4")),
     "folder for camera.json": (folder_for_file, ("rec",)),

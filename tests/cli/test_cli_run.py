@@ -462,7 +462,7 @@ def test_optimize_reports_false_loops_and_components(tmp_path, capsys) -> None:
     output = capsys.readouterr().out
     assert "1 edge rejected as inconsistent with the others" in output
     assert re.search(r"part from vertex 0: 5 poses, 8 edges", output)
-    assert re.search(r"part from vertex 9: 1 poses, 0 edges", output)
+    assert re.search(r"part from vertex 9: 1 pose, 0 edges", output)
     assert "No other poses fit these measurements better" in output
     assert read_g2o(tmp_path / "out.g2o").poses[4, 0, 3] == pytest.approx(4.0, abs=0.02)
     # By default it is least squares of what is in the file.

@@ -32,7 +32,7 @@ def test_loops_from_file(tmp_path):
 @pytest.mark.parametrize(
     ("line", "problem"),
     [
-        ("1", "has 1 values"),
+        ("1", "has 1 value"),
         ("1 2 3", "has 3 values"),
         ("a 2", "is not understood"),
         ("1.5 2", "is not understood"),

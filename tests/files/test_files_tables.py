@@ -15,6 +15,28 @@ def test_numbers_are_read_with_any_separator(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_numbers(tmp_path / "a.txt"), [[1, 2, 3], [4, 5, 6]])
 
 
+def test_missing_values_of_windows_programs(tmp_path: Path) -> None:
+    words = [
+        "nan",
+        "-nan(ind)",
+        "nan(snan)",
+        "1.#QNAN",
+        "-1.#IND00",
+        "1.#QO",
+        "-1.#IO",
+        "1.#R",
+        "-1.$",
+        "1.#INF",
+        "1.#J",
+    ]
+    (tmp_path / "a.xyz").write_text("".join(f"{word} 1.5 2.5 # 1.#\n" for word in words))
+    table = read_numbers(tmp_path / "a.xyz")
+    assert np.isnan(table[:, 0]).all()
+    np.testing.assert_array_equal(table[:, 1:], [[1.5, 2.5]] * len(words))
+    (tmp_path / "a.csv").write_text("a,b\n-1.#IND,2\n")
+    np.testing.assert_array_equal(read_columns(tmp_path / "a.csv")["a"], [np.nan])
+
+
 def test_header_of_cloudcompare_is_a_comment(tmp_path: Path) -> None:
     (tmp_path / "a.xyz").write_text("//X Y Z\n1 2 3\n")
     np.testing.assert_array_equal(read_numbers(tmp_path / "a.xyz"), [[1, 2, 3]])
@@ -27,7 +49,7 @@ def test_decimal_commas_are_no_separators(tmp_path: Path, text: str) -> None:
         read_numbers(tmp_path / "a.csv")
 
 
-@pytest.mark.parametrize("text", ["1 2\n3\n", "1 b\n", "1 2\n3 4 5\n", "\0\0\0\0"])
+@pytest.mark.parametrize("text", ["1 2\n3\n", "1 b\n", "1 2\n3 4 5\n", "1 nan(x)\n", "\0\0\0\0"])
 def test_bad_numbers_are_rejected(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.txt").write_text(text)
     with pytest.raises(InputError, match=r"a\.txt"):

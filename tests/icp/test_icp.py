@@ -132,5 +132,5 @@ def test_views_with_too_few_points_are_refused(count):
     good = CloudFrame.of(corner(100, 0), index=3)
     bad = CloudFrame.of(np.zeros((count, 3)), index=8)
     for source, target in ((good, bad), (bad, good)):
-        with pytest.raises(RegistrationError, match=f"frame 8: has {count} points"):
+        with pytest.raises(RegistrationError, match=f"frame 8: has {count} point"):
             algorithm_1().register(source, target, np.eye(4), rng())

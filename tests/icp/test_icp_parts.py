@@ -155,7 +155,7 @@ def test_degenerate_pairs_are_refused(source):
 @pytest.mark.parametrize("m", [0, 1, 2])
 def test_fewer_than_three_pairs_are_refused(m):
     a = alignment(np.eye(3), np.eye(3))
-    with pytest.raises(RegistrationError, match=f"only {m} points"):
+    with pytest.raises(RegistrationError, match=f"only {m} corresponding point"):
         PointToPoint().motion(pairs(m), a)
 
 

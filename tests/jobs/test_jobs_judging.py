@@ -196,6 +196,8 @@ def test_unusable_poses_are_refused(recording, truth, tmp_path) -> None:
     one[3] = np.eye(4)
     with pytest.raises(InputError, match="has a pose for 1 of the 8 frames"):
         tofuse.judge(recording, one)
+    with pytest.raises(InputError, match="has a single frame, whose pose nothing contradicts"):
+        tofuse.judge(recording[:1], truth[:1])
     with pytest.raises(InputError, match="has no rotation"):
         tofuse.judge(recording, truth * np.array([2.0, 1, 1, 1]))
     write_tum(tmp_path / "late.txt", recording.timestamps + 1000, truth)

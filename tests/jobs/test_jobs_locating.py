@@ -72,6 +72,32 @@ def test_frame_of_second_pass_is_located(here, k) -> None:
     assert np.linalg.eigvalsh(location.covariance)[-1] < 0.1**2
 
 
+def test_camera_that_focuses_is_that_of_the_map(here) -> None:
+    """Phones state the lens of each frame, which differs by fractions of a pixel."""
+    frame = seen(AGAIN[1], 501)
+    for shift, same in ((0.5, True), (5.0, False)):
+        camera = replace(frame.camera, cx=frame.camera.cx + shift)
+        config = here._map._config_of(replace(frame, camera=camera))
+        assert (config is here._map.config) == same
+
+
+def test_single_frame_is_corrected_like_its_recording(
+    session_results, clip, capsys, monkeypatch
+) -> None:
+    """A frame of another camera, without its noise model, would count as exact."""
+    monkeypatch.setattr(
+        locating.ResultMap,
+        "locate_frame",
+        lambda _, frame, recording: locating.LocatedFrame(
+            frame.index, 0, None, str(len(recording))
+        ),
+    )
+    assert call("locate", session_results["here"], f"{clip}#3") == 3
+    assert call("locate", session_results["here"], clip, "--start", 3, "--end", 4) == 3
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[::2] == ["rejected frame 3; 6", "rejected frame 3; 1"]
+
+
 @pytest.mark.parametrize("scene", FOREIGN)
 @pytest.mark.parametrize("k", [0, 3])
 def test_frame_of_another_room_is_not_accepted(here, scene, k) -> None:

@@ -223,7 +223,7 @@ def test_no_frames_and_no_usable_frames_are_refused(frames) -> None:
         Mapper().finish()
     mapper = Mapper()
     assert mapper.push(blank(frames[0])) is None
-    with pytest.raises(InputError, match=r"none of the 1 frames has enough valid points.*0 valid"):
+    with pytest.raises(InputError, match=r"has 1 frame, none with enough valid points.*0 valid"):
         mapper.finish()
 
 
@@ -311,9 +311,12 @@ def test_clouds_all_around_have_z_up(frames) -> None:
     points = frames[0].points[::6]
     axes = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])  # x forward, y left, z up
     for turned, up in ((points, [0, -1, 0]), (points @ axes.T, [0, 0, 1])):
-        assert CloudFrame.of(turned).z_is_up == (up[2] == 1)
+        assert (CloudFrame.of(turned).likely_up is None) == (up[2] == 0)
         result = reconstruct(in_memory([CloudFrame.of(turned)]))
         np.testing.assert_allclose(result.T_up_world[1, :3], up, atol=0.02)
+    stated = CloudFrame.of(points, up=np.array([1.0, 0, 0]))
+    result = reconstruct(in_memory([stated]))
+    np.testing.assert_allclose(result.T_up_world[1, :3], [1, 0, 0], atol=0.02)
 
 
 def test_given_tracker_tracks_clouds_too(frames) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import tofuse
 from cli_calls import call
 from registration_scenes import error, stone, turn
+from tofuse.apps.pairs import pair_json, register_files
 from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh
 from tofuse.engine.geometry import se3
 from tofuse.formats.export import exchange
@@ -205,3 +207,12 @@ def test_pose_is_accepted_at_a_stated_risk() -> None:
     np.testing.assert_array_equal(rejected.T_target_source, found.T_target_source)
     with pytest.raises(tofuse.TofuseError, match=r"risk: is 0\.2"):
         tofuse.register(source, target, risk=0.2)
+
+
+def test_warning_of_a_recording_is_stated_once_for_both_frames(room_recording, tmp_path) -> None:
+    shutil.copytree(room_recording, tmp_path / "room")
+    path = tmp_path / "room" / "camera.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"colour_of_case": "grey"}))
+    found = pair_json(register_files(f"{path.parent}#1", f"{path.parent}#0"))
+    assert len(found["warnings"]) == 1
+    assert "colour_of_case" in found["warnings"][0]

@@ -84,7 +84,7 @@ def test_duplicate_part_names_are_refused() -> None:
         (None, r"my\.toml: is None"),
         ({"part": "square"}, r"my\.toml: .corner. is missing; add corner"),
         ({"part": "square", "corner": 3}, r"my\.toml: corner: is 3; write a list"),
-        ({"part": "square", "corner": [1]}, r"my\.toml: corner: has 1 values; use 2"),
+        ({"part": "square", "corner": [1]}, r"my\.toml: corner: has 1 value; use 2"),
         ({"part": "square", "corner": [1, "b"]}, r"my\.toml: corner\[1\]: is 'b'"),
         ({"part": "square", "corner": [1, 2], "count": 1.5}, r"count: is 1\.5; use a whole number"),
         ({"part": "square", "corner": [1, 2], "solid": 1}, r"solid: is 1; use true or false"),

@@ -82,6 +82,19 @@ def test_npz_errors_name_the_problem(tmp_path: Path, changes: dict[str, Any], me
         open_recording(tmp_path / "a.npz")
 
 
+def test_negative_depth_of_a_file_is_named(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", **made.arrays(depth=-0.001 * made.COUNTS))
+    with pytest.raises(InputError, match="holds negative depth only; negate it"):
+        open_recording(tmp_path / "a.npz")
+
+
+def test_npy_alone_says_what_it_lacks(tmp_path: Path) -> None:
+    np.save(tmp_path / "depth.npy", made.COUNTS)
+    for path in (tmp_path, tmp_path / "depth.npy"):
+        with pytest.raises(InputError, match=r"depth and K by numpy\.savez"):
+            open_recording(path)
+
+
 def test_zense(tmp_path: Path) -> None:
     made.make_zense(tmp_path / "scan")
     recording = open_recording(tmp_path / "scan")

@@ -485,6 +485,22 @@ def test_xyz(tmp_path: Path) -> None:
     assert frames[6].color[0].tolist() == [10, 20, 30]
 
 
+_PLY = """ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y
+property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"""
+_PCD = """VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 3\nHEIGHT 1
+POINTS 3\nDATA ascii\n"""
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "end"),
+    [("a.ply", _PLY, "3 0 1 2\n"), ("a.pcd", _PCD, ""), ("a.xyz", "", ""), ("a.3d", "3\n", "")],
+)
+def test_points_that_windows_programs_write_as_missing(tmp_path, name, head, end) -> None:
+    rows = "1.#QNAN 1.#QNAN 1.#QNAN\n4 5 6\n-nan(ind) nan(snan) -1.#IND\n"
+    (tmp_path / name).write_text(head + rows + end)
+    assert len(open_recording(tmp_path)[0]) == 1
+
+
 @pytest.mark.parametrize(
     "head", ["X Y Z Nx Ny Nz\n", "x;y;z;nx;ny;nz\n", "20\n", "//X Y Z\n", "\n", ""]
 )

@@ -144,7 +144,7 @@ def test_nerfstudio_with_angle_fisheye_and_float_depth(tmp_path: Path) -> None:
     assert not frame.valid[1, 1]
     np.testing.assert_array_equal(frame.depth[2:], DEPTH[1][2:])
     assert np.isfinite(recording.reference).all((1, 2)).tolist() == [False, True, False]
-    assert any("1 poses can't be read" in line for line in recording.warnings)
+    assert any("1 pose can't be read" in line for line in recording.warnings)
     changed(folder, camera_model="OPENCV_FISHEYE", k1=0.01)
     frame = open_recording(folder)[0]
     assert isinstance(frame.camera, Fisheye)

@@ -127,6 +127,13 @@ def test_las_written_by_laspy(tmp_path: Path, suffix: str) -> None:
     assert np.array_equal(frame.color, RGB)
 
 
+def test_z_of_las_is_up_wherever_the_points_are(tmp_path: Path) -> None:
+    """A tile of a map may lie above zero as a whole, like what a camera sees along z."""
+    points = POINTS + np.array([0, 0, 9 - POINTS[:, 2].min()])
+    result = tofuse.reconstruct(tofuse.open(written(tmp_path / "a.las", points)))
+    assert np.allclose(result.T_up_world[1, :3], [0, 0, 1])
+
+
 def written(path: Path, points: np.ndarray = POINTS, **header: object) -> Path:
     """A file of points as laspy writes it."""
     laspy = pytest.importorskip("laspy")
@@ -236,7 +243,7 @@ def test_e57(tmp_path: Path) -> None:
         columns["intensity"] = np.linspace(0, 1, 500)
         file.write_scan_raw(
             columns,
-            rotation=np.array([half, 0.0, 0.0, half * k] if k else [1.0, 0.0, 0.0, 0.0]),
+            rotation=np.array([half, half * k, 0.0, 0.0] if k else [1.0, 0.0, 0.0, 0.0]),
             translation=np.array([1.0 * k, 0.0, 0.5]),
         )
     file.close()
@@ -248,8 +255,10 @@ def test_e57(tmp_path: Path) -> None:
     assert np.array_equal(frame.color, RGB)
     assert frame.amplitude[-1] == pytest.approx(1.0)
     reference = recording.reference
-    assert np.allclose(reference[1][:3, :3], to_matrix(np.array([0, 0, half, half])))
+    assert np.allclose(reference[1][:3, :3], to_matrix(np.array([half, 0, 0, half])))
     assert np.allclose(reference[1][:3, 3], [1.0, 0.0, 0.5])
+    # z of the map is up: y of the scan that was turned about x.
+    assert np.allclose([recording[0].up, frame.up], [[0, 0, 1], [0, 1, 0]])
 
     (tmp_path / "more.e57").write_bytes(path.read_bytes())
     folder = tofuse.open(tmp_path)  # scanners write a file for each scan
@@ -278,3 +287,4 @@ def test_ptx_states_poses_for_row_vectors(tmp_path: Path) -> None:
     np.testing.assert_array_equal(third.points, first.points)
     T = [[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]]
     np.testing.assert_allclose(recording.reference, [T] * 3)
+    np.testing.assert_allclose(first.up, [0, 0, 1])

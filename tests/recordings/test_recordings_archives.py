@@ -15,7 +15,7 @@ import pytest
 import made_phones as made
 from tofuse.apps.cli.program import main
 from tofuse.apps.inspection.inspect import inspect_recording
-from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.errors import InputError, InputWarning, UnreadableFrameError
 from tofuse.formats.recordings.archives import unzipped
 from tofuse.formats.recordings.open import open_recording, open_view
 
@@ -144,12 +144,39 @@ def cut_off(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-40])
 
 
+def cut_off_after_archive(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("camera.json", b"{}")
+        with archive.open("correction.npz", "w") as file:
+            np.savez(file, curve=np.zeros(3))
+        end = archive.fp.tell()
+    path.write_bytes(path.read_bytes()[:end])
+
+
+def damage(path: Path, member: str) -> None:
+    """Change some bytes of a file in an archive."""
+    with zipfile.ZipFile(path) as archive:
+        start = archive.getinfo(member).header_offset + 30 + len(member)
+    data = bytearray(path.read_bytes())
+    data[start + 10 : start + 15] = b"\xff" * 5
+    path.write_bytes(data)
+
+
 def damaged(path: Path) -> None:
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("info.json", b"abcdefgh" * 1000)
-    data = bytearray(path.read_bytes())
-    data[45:50] = b"\xff" * 5
-    path.write_bytes(data)
+    damage(path, "info.json")
+
+
+def test_damaged_image_in_archive_costs_its_frame_alone(tmp_path: Path) -> None:
+    made.make_scanner_app(tmp_path / "scan")
+    path = zipped(tmp_path / "scan", tmp_path / "scan.zip", "scan")
+    damage(path, "scan/depth_00001.png")
+    with pytest.warns(InputWarning, match=r"scan\.zip: scan/depth_00001\.png can't be unpacked"):
+        recording = open_recording(path)
+    assert [frame.index for frame in recording.readable(3)] == [0, 2]
+    with pytest.raises(UnreadableFrameError, match=r"depth_00001\.png"):
+        recording[1]
 
 
 @pytest.mark.parametrize(
@@ -163,6 +190,7 @@ def damaged(path: Path) -> None:
         (with_member("link", link=True), "contains a link"),
         (bomb, "far more than measurements"),
         (cut_off, "copy the file again"),
+        (cut_off_after_archive, "is cut off before its end"),
         (damaged, "copy the file again"),
         (lambda path: zipfile.ZipFile(path, "w").close(), "is an empty archive"),
     ],

@@ -19,9 +19,9 @@ from tofuse.formats.recordings.open import SingleView
 T = se3.exp([0.1, -0.05, 0.02, 0.02, 0.1, -0.05])
 
 
-def local(points: np.ndarray, format: str = "ply", center=(0, 0, 0)) -> SingleView:  # noqa: A002
-    frame = replace(view(points), shift=np.asarray(center, float))
-    return SingleView("a", "a", format, 0, frame)
+def local(points: np.ndarray, up=None, center=(0, 0, 0)) -> SingleView:
+    frame = replace(view(points), shift=np.asarray(center, float), up=up)
+    return SingleView("a", "a", "ply", 0, frame)
 
 
 def pair(points: np.ndarray, others: np.ndarray, pose=T, **more) -> PairResult:
@@ -75,13 +75,17 @@ def test_wrong_pose_is_visible() -> None:
 
 
 @pytest.mark.parametrize(
-    ("format", "center", "up"), [("ply", (0, 0, 0), False), ("las", (0, 0, 0), True),
-                                 ("ply", (5e5, 4e6, 0), True)],
-)  # fmt: skip
-def test_maps_and_scans_are_upright(format, center, up) -> None:  # noqa: A002
+    ("up", "center", "is_turned"),
+    [
+        (None, (0, 0, 0), False),
+        (np.array([0.0, 0, 1]), (0, 0, 0), True),
+        (None, (5e5, 4e6, 0), True),
+    ],
+)
+def test_maps_and_scans_are_upright(up, center, is_turned) -> None:
     """Down is y for the viewer; in a map up is z."""
     points = relief(500, 1)
-    scene, _ = pair_scene(pair(points, points, pose=np.eye(4), format=format, center=center))
+    scene, _ = pair_scene(pair(points, points, pose=np.eye(4), up=up, center=center))
     shown = scene.points[500:]
     turned = np.column_stack([points[:, 0], -points[:, 2], points[:, 1]])
-    np.testing.assert_allclose(shown, turned if up else points, atol=1e-5)
+    np.testing.assert_allclose(shown, turned if is_turned else points, atol=1e-5)

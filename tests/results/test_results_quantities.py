@@ -2,7 +2,7 @@
 
 import pytest
 
-from tofuse.engine.quantities import length, percent, probability
+from tofuse.engine.quantities import count, length, one, percent, probability
 
 
 def test_length_has_two_or_three_digits_that_matter():
@@ -23,3 +23,8 @@ def test_all_is_not_claimed_for_less():
     assert (percent(0.9999), percent(1.0), percent(1.2)) == ("99.9 %", "100 %", "120 %")
     assert [probability(p) for p in (0.0, 0.97, 1.0)] == ["below 0.1 %", "97 %", "over 99.9 %"]
     assert percent(None) == percent(float("nan")) == "–"
+
+
+def test_nouns_agree_with_numbers_and_articles():
+    assert [count(n, "frame") for n in (0, 1, 12_000)] == ["0 frames", "1 frame", "12,000 frames"]
+    assert [one(noun) for noun in ("int", "list", "ndarray")] == ["an int", "a list", "an ndarray"]

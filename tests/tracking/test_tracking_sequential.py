@@ -114,7 +114,7 @@ def test_degenerate_registration_loses_frame():
     assert tracker.push(CloudFrame.of(points, index=4)).status == "tracked"
     for frame, why in (
         (CloudFrame.of(points, index=5), "lie on a line"),
-        (CloudFrame.of(points + 100, index=6), "only 0 points"),
+        (CloudFrame.of(points + 100, index=6), "only 0 corresponding points"),
     ):
         step = tracker.push(frame)
         assert step.status == "lost"

@@ -23,6 +23,7 @@ import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
+from tofuse.engine import quantities
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.errors import InputError
 
@@ -188,7 +189,9 @@ def _from_sequence(origin: Any, args: tuple[Any, ...], data: Any, where: str) ->
     if origin is tuple and not (len(args) == 2 and args[1] is Ellipsis):
         if len(data) != len(args):
             raise InputError(
-                f"has {len(data)} values", where=where, remedy=f"use {len(args)} values"
+                f"has {quantities.count(len(data), 'value')}",
+                where=where,
+                remedy=f"use {quantities.count(len(args), 'value')}",
             )
         hints = list(args)
     else:

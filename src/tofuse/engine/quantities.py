@@ -32,6 +32,11 @@ def probability(value: float | None) -> str:
     return f"below {percent(limit)}" if value < limit else f"over {percent(MAX_PROBABILITY)}"
 
 
+def one(noun: str) -> str:
+    """Return a noun with its indefinite article, by its sound: "a list", "an int", "an ndarray"."""
+    return f"{'an' if noun.startswith(('a', 'e', 'i', 'o', 'u', 'nd')) else 'a'} {noun}"
+
+
 def count(number: int, noun: str) -> str:
     """Return a number of things as text: "1 frame", "12,000 points"."""
     return f"{number:,} {noun}" + ("" if number == 1 else "s")

@@ -34,7 +34,8 @@ from tofuse.apps.results import (
     run_json,
     write_result,
 )
-from tofuse.engine.errors import InputError
+from tofuse.engine import quantities
+from tofuse.engine.errors import InputError, signals_as_themselves
 from tofuse.engine.frames import Frame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
@@ -101,6 +102,7 @@ class Result(Reconstruction):
         """The accuracy card, in one line."""
         return accuracy_card.SEPARATOR.join(accuracy_card.card(self))
 
+    @signals_as_themselves()
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
         """Write the files of ``tofuse run``, and return the folder.
 
@@ -178,6 +180,7 @@ class Result(Reconstruction):
             config=self.config,
         )
 
+    @signals_as_themselves()
     def locate(self, frame: Frame) -> locating.LocatedFrame:
         """Find where an image was taken: its pose in this map, as ``tofuse locate`` does.
 
@@ -206,6 +209,7 @@ class Result(Reconstruction):
             return locating.ResultMap.read(self.folder, None, Silent())
         return locating.ResultMap.of_result(self.source, self.fitted, self)
 
+    @signals_as_themselves()
     def distance(self, point_a: ArrayLike, point_b: ArrayLike) -> Length:
         """Return the distance of two points of the model, with its 95 % interval and causes.
 
@@ -320,6 +324,7 @@ class Mapper(OnlineMapper):
         return Result.of(super().finish())
 
 
+@signals_as_themselves()
 def reconstruct(
     recording: Recording,
     config: Config | str | Mapping[str, Any] = "default",
@@ -364,7 +369,7 @@ def reconstruct(
     """
     if not isinstance(recording, Recording):
         raise InputError(
-            f"is a {type(recording).__name__}, not a recording",
+            f"is {quantities.one(type(recording).__name__)}, not a recording",
             where="recording",
             remedy="pass tofuse.open(path), or tofuse.from_arrays(depth, K)",
         )
@@ -384,6 +389,7 @@ def reconstruct(
     return Result.of(with_findings(reconstruction, findings, turning=turning), recording, fitted)
 
 
+@signals_as_themselves()
 def merge(
     results: Sequence[str | Path],
     *,
@@ -425,6 +431,7 @@ def _with_terminal(progress: Progress | bool | None) -> AbstractContextManager[P
     return progress_in_python() if progress is True else nullcontext(receiver(progress))
 
 
+@signals_as_themselves()
 def load(folder: str | Path, *, edited: bool = False) -> Result:
     """Read a result of ``tofuse run`` or `Result.save` from its folder.
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from glob import escape, glob, has_magic
 from pathlib import Path
 
+from tofuse.engine import quantities
 from tofuse.engine.errors import InputError
 from tofuse.formats.files import reading, stamps
 
@@ -172,7 +173,7 @@ def _csv_rows(text: str, path: Path) -> Iterator[_Row]:
         where = f"{path}: row {k + 1}"
         if len(cells) != len(header):
             raise InputError(
-                f"has {len(cells)} cells, but there are {len(header)} columns",
+                f"has {quantities.count(len(cells), 'cell')}, but there are {len(header)} columns",
                 where=where,
                 remedy="use one cell per column, and quote cells that contain a comma",
             )

@@ -12,6 +12,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
 from tofuse.apps.calibration.board import Board, board_pose, search_board
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole
 from tofuse.engine.errors import InputError
@@ -213,7 +214,8 @@ def _check_count(recording: Recording, board: Board, views: list[BoardView], det
             remedy="check --board; have all of the board in view, matt, with a white margin",
         )
     raise InputError(
-        f"shows the board from {len(views)} distinct viewpoints (in {detected} frames); at least "
+        f"shows the board from {len(views)} distinct viewpoints (in "
+        f"{quantities.count(detected, 'frame')}); at least "
         f"{MIN_VIEWS} are needed",
         where=recording.path,
         remedy="record it from 15 places or more, tilted to all sides and all over the image",

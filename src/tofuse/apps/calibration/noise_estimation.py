@@ -12,6 +12,7 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.stats import chi2
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.errors import InputError
@@ -162,7 +163,8 @@ def estimate_noise(recording: Recording, name: str | None = None) -> NoiseFit:
     ]
     if not stretches:
         raise InputError(
-            f"has {len(recording)} frames, and no {MIN_FRAMES} consecutive static frames",
+            f"has {quantities.count(len(recording), 'frame')}, and no {MIN_FRAMES} "
+            f"consecutive static frames",
             where=recording.path,
             remedy="record ten frames or more with the camera on a stand, nothing moving",
         )

@@ -23,6 +23,7 @@ from tofuse.apps.calibration import (
 from tofuse.apps.cli.commands import show, warning_lines
 from tofuse.apps.cli.options import Calibrate, Noise
 from tofuse.apps.cli.progress import escaped
+from tofuse.engine import quantities
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, Recording
@@ -67,7 +68,7 @@ def noise(arguments: Noise) -> int:
         arguments,
         fit.to_dict(),
         table,
-        f"{escaped(fit.model.name)}, {fit.frames} frames in "
+        f"{escaped(fit.model.name)}, {quantities.count(fit.frames, 'frame')} in "
         f"{count(fit.stretches, 'static segment')}: the noise model over {fit.law} deviates by "
         f"{100 * fit.rms_log_error:.0f} % rms "
         f"(built-in model: {100 * fit.rms_log_error_before:.0f} %)",
@@ -88,8 +89,8 @@ def _lens(arguments: Calibrate) -> Summary:
     fit = calibrate_lens(recording, board, arguments.model, arguments.image)
     lines = [_number(fit.camera, name, fit.sigma.get(name)) for name in fit.to_dict()["lens"]]
     lines.append(
-        f"{len(fit.views)} views, reprojection error {fit.rms_px:.3f} px rms (with the recording's "
-        f"own intrinsics: {fit.rms_px_before:.3f})"
+        f"{quantities.count(len(fit.views), 'view')}, reprojection error {fit.rms_px:.3f} px rms "
+        f"(with the recording's own intrinsics: {fit.rms_px_before:.3f})"
     )
     lines += [f"left out: frame {frame} {reason}" for frame, reason in fit.left_out[:_MAX_LISTED]]
     if len(fit.left_out) > _MAX_LISTED:
@@ -115,7 +116,8 @@ def _depth(arguments: Calibrate) -> Summary:
     fit = calibrate_depth(views, camera, recording.path)
     low, high = fit.range_m
     lines = [
-        f"{fit.planes} planes in {fit.frames} frames, {low:.2f} to {high:.2f} m",
+        f"{quantities.count(fit.planes, 'plane')} in {quantities.count(fit.frames, 'frame')}, "
+        f"{low:.2f} to {high:.2f} m",
         f"rms distance of pixels from the planes: {1000 * fit.before_m:.1f} mm, corrected "
         f"{1000 * fit.after_m:.1f} mm (including noise)",
         f"systematic part (means of patches): {1000 * fit.bias_before_m:.1f} mm, corrected "

@@ -332,7 +332,7 @@ def print_result(result: Reconstruction, out: Path, *, as_json: bool) -> None:
     parts += [f"{counts[s]} {s}" for s in ("predicted", "lost") if counts[s]]
     parts += [f"{skipped} unreadable"] if skipped else []
     parts += [f"{count(closures, 'loop')} closed"]
-    parts += [f"{len(result.cloud):,} points"]
+    parts += [count(len(result.cloud), "point")]
     components = [
         f"and {_page_of(out / folders.component_name(number))}, for "
         f"{frame_ranges.in_words(component.frames)}"
@@ -436,7 +436,7 @@ def record(arguments: cli.Record) -> int:
             progress=lambda _: progress.advance(),
             seen=None if live_map is None else live_map.offer,
         )
-    warnings = [f"{recorded.dropped} frames dropped: the disk was too slow"]
+    warnings = [f"{count(recorded.dropped, 'frame')} dropped: the disk was too slow"]
     _print_lines(
         f"{count(recorded.frames, 'frame')} in {escaped(str(recorded.folder))}",
         *warning_lines(warnings if recorded.dropped else []),
@@ -562,7 +562,8 @@ def optimize(arguments: cli.Optimize) -> int:
 
 def _optimised(graph: PoseGraph, solution: Optimisation, kept: Bool) -> Iterator[str]:
     yield (
-        f"{len(graph.ids)} poses, {len(graph.edges)} edges: squared error {graph.chi2():.6g} "
+        f"{count(len(graph.ids), 'pose')}, "
+        f"{count(len(graph.edges), 'edge')}: squared error {graph.chi2():.6g} "
         f"to {solution.graph.chi2():.6g} in {max(len(solution.objective) - 1, 0)} iterations"
         + ("" if solution.converged else " (not converged)")
     )
@@ -573,7 +574,8 @@ def _optimised(graph: PoseGraph, solution: Optimisation, kept: Bool) -> Iterator
         )
     for piece in solution.parts if len(solution.parts) > 1 else ():
         yield (
-            f"part from vertex {piece.first}: {piece.vertices} poses, {piece.edges} edges, "
+            f"part from vertex {piece.first}: {count(piece.vertices, 'pose')}, "
+            f"{count(piece.edges, 'edge')}, "
             f"objective {piece.before:.6g} to {piece.after:.6g}"
         )
     if not solution.improved:

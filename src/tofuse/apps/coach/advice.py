@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.apps.certainty import Known
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, signals_as_themselves
 from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import Mapper
@@ -70,6 +71,7 @@ class Advice:
         return self.bound_m - self.expected_m if np.isfinite(self.bound_m) else 0.0
 
 
+@signals_as_themselves()
 def advise(source: Mapper | Reconstruction) -> Advice | None:
     """Say where to look or walk next so that the bound on the errors of the poses falls.
 
@@ -95,7 +97,7 @@ def advise(source: Mapper | Reconstruction) -> Advice | None:
         return advise_on(source.so_far())
     if not isinstance(source, Reconstruction):
         raise InputError(
-            f"is a {type(source).__name__}, neither a mapper nor a result",
+            f"is {quantities.one(type(source).__name__)}, neither a mapper nor a result",
             where="source",
             remedy="pass a tofuse.Mapper, or a result of tofuse.reconstruct or tofuse.load",
         )

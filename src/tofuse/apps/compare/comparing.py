@@ -22,7 +22,7 @@ from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.clouds import AnyPair
-from tofuse.engine.errors import InputError, RegistrationError
+from tofuse.engine.errors import InputError, RegistrationError, signals_as_themselves
 from tofuse.engine.frames import CloudFrame
 from tofuse.engine.fusion import GeometryRecord
 from tofuse.engine.geometry import se3
@@ -273,6 +273,7 @@ def millimetres(metres: float) -> str:
     return f"{mm:z.2f}" if abs(mm) < 9.995 else f"{mm:.1f}"
 
 
+@signals_as_themselves()
 def compare(
     result: Comparable,
     reference: Comparable,

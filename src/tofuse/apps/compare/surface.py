@@ -10,6 +10,7 @@ import numpy as np
 
 from tofuse.apps.pairs import named_view
 from tofuse.apps.results import folders, load_result
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64, Int32
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame
@@ -148,7 +149,7 @@ def _of_record(record: GeometryRecord, name: str) -> Surface:
         sigma = None
     if len(points) < (_MIN_POINTS if faces is None else 3):
         raise InputError(
-            f"has {len(points)} points and no triangles",
+            f"has {quantities.count(len(points), 'point')} and no triangles",
             where=name,
             remedy=f"use a mesh, or {_MIN_POINTS} points or more",
         )

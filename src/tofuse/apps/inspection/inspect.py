@@ -15,9 +15,10 @@ from tofuse.apps.inspection import channels, geometry, motion_checks, pose_conve
 from tofuse.apps.inspection.finding import SEVERITIES, Finding
 from tofuse.apps.inspection.sample import Sample
 from tofuse.apps.inspection.values import depths_of, valid_fraction
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float32
 from tofuse.engine.cameras import Pinhole, RayTable
-from tofuse.engine.errors import InputError, shown
+from tofuse.engine.errors import InputError, shown, signals_as_themselves
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.noise import family_of
 from tofuse.engine.quantities import count, percent
@@ -102,6 +103,7 @@ class Inspection:
         }
 
 
+@signals_as_themselves()
 def inspect_recording(
     recording: Recording | str | Path, *, turning: bool = False, quick: bool = False
 ) -> Inspection:
@@ -169,7 +171,7 @@ def _time(recording: Recording) -> str:
 
 def _view_facts(recording: Recording, frame: Frame) -> dict[str, str]:
     if not isinstance(frame, RangeFrame):
-        return {"views": f"clouds of about {len(frame)} points"}
+        return {"views": f"clouds of about {quantities.count(len(frame), 'point')}"}
     camera = frame.camera
     lens = camera.fit if isinstance(camera, RayTable) else camera
     rays = camera.rays()

@@ -11,9 +11,10 @@ import numpy as np
 
 from tofuse.apps.inspection import difference
 from tofuse.apps.results import folders, run_json
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, signals_as_themselves
 from tofuse.engine.frames import Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number
@@ -66,10 +67,11 @@ class Evaluation:
         e = self.error
         return (
             f"Evaluation: ATE {e.ate_rms_m:.4f} m, {np.degrees(e.rotation_rms_rad):.3f} deg rms "
-            f"over {e.associated} poses"
+            f"over {quantities.count(e.associated, 'pose')}"
         )
 
 
+@signals_as_themselves()
 def evaluate(
     estimate: Poses,
     reference: Poses,
@@ -240,6 +242,8 @@ def _timed(
         return timed.timed(clock, name)
     if len(timed.poses) != len(clock[0]):
         raise InputError(
-            f"holds {len(timed.poses)} poses, and the recording {len(clock[0])} frames", where=name
+            f"holds {quantities.count(len(timed.poses), 'pose')}, and the recording "
+            f"{quantities.count(len(clock[0]), 'frame')}",
+            where=name,
         )
     return clock[0], timed.poses

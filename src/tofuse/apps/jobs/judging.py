@@ -28,7 +28,7 @@ from tofuse.apps.results import folders, run_json, stated_accuracy, write_result
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.compute import threads as use_threads
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, signals_as_themselves
 from tofuse.engine.frames import Frame, Recording, Source, evenly_spaced, frame_ranges
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import (
@@ -163,6 +163,7 @@ def _dict(figures: Any) -> dict[str, Any] | None:
     return None if figures is None else figures.to_dict()
 
 
+@signals_as_themselves()
 def judge(
     recording: Recording | str | Path,
     trajectory: str | Path | Float64 | Reconstruction,
@@ -614,7 +615,7 @@ def poses_for(recording: Recording, trajectory: str | Path | Float64 | Reconstru
     Raises
     ------
     InputError
-        If fewer than two frames have a pose, or an array has the wrong shape.
+        If there are fewer than two frames with a pose, or an array has the wrong shape.
     """
     where = "trajectory"
     if isinstance(trajectory, str | Path):
@@ -626,6 +627,12 @@ def poses_for(recording: Recording, trajectory: str | Path | Float64 | Reconstru
         poses = timed.of_frames(recording.timestamps, recording.indices)
     else:
         poses = se3.check_poses(trajectory, where=where, count=len(recording))
+    if len(recording) == 1:
+        raise InputError(
+            "has a single frame, whose pose nothing contradicts",
+            where=recording.path,
+            remedy="pass a recording of several",
+        )
     n_posed = int(np.isfinite(poses).all((1, 2)).sum())
     if n_posed < 2:
         raise InputError(

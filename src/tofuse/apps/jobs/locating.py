@@ -18,6 +18,7 @@ from tofuse._version import __version__
 from tofuse.apps.jobs.sessions import sessions_of, with_given_poses
 from tofuse.apps.pairs import PairOptions, pair_words, register_files
 from tofuse.apps.results import folders, run_json
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Camera
 from tofuse.engine.compute import threads
@@ -160,17 +161,17 @@ class ResultMap:
             ]
         )
 
-    def locate_frame(self, frame: Frame) -> LocatedFrame:
-        """Locate a single frame."""
+    def locate_frame(self, frame: Frame, recording: Recording | None = None) -> LocatedFrame:
+        """Locate a single frame, of a recording if that is known."""
         if not isinstance(frame, RangeFrame):
             kind = "cloud" if isinstance(frame, CloudFrame) else type(frame).__name__
             raise InputError(
-                f"is a {kind}, not an image of a camera",
+                f"is {quantities.one(kind)}, not an image of a camera",
                 where="frame",
                 remedy="pass a frame of tofuse.open or tofuse.from_arrays; register a cloud with "
                 "the points of the map: tofuse.register",
             )
-        view = clips.prepared_view(frame, self._config_of(frame))
+        view = clips.prepared_view(frame, self._config_of(frame, recording))
         found = self.locator.locate([PosedView(view, np.eye(4))])
         return _located(frame.index, frame.timestamp, found.get(view.index))
 
@@ -232,12 +233,18 @@ class ResultMap:
 
     def _config_of(self, frame: Frame | None, recording: Recording | None = None) -> Config:
         """Return how a frame is corrected: as those of the map if it is of the same camera."""
-        if isinstance(frame, RangeFrame) and self.camera is not None:
-            same = np.array_equal(frame.camera.rays(), self.camera.rays())
-            if same:
-                return self.config
+        if isinstance(frame, RangeFrame) and _is_same(frame.camera, self.camera):
+            return self.config
         config = replace(from_method("default"), odometry=self.config.odometry)
         return config if recording is None else adaptation.adapted(config, recording)
+
+
+def _is_same(camera: Camera, known: Camera | None) -> bool:
+    """Whether two cameras have the same pixels: phones focus, which moves their rays by less."""
+    if known is None or known.rays().shape != camera.rays().shape:
+        return False
+    pitch = np.nanmedian(np.abs(np.diff(known.rays()[..., 0], axis=1)))
+    return bool(np.nanmax(np.abs(camera.rays() - known.rays())) < pitch)
 
 
 def _located(
@@ -280,28 +287,29 @@ def _located_in(
     result: Path, name: str, options: LocateOptions, progress: Progress
 ) -> list[LocatedFrame]:
     folders.check_result(result)
-    recording, (path, number) = None, split_name(name)
+    path, number = split_name(name)
     frame: Frame | None
     if number is None:
         recording = Opening.of([path], options).open()
         check_one_camera(recording)
         frame = recording.first_readable()
+        is_clip = len(recording) > 1
     elif (options.start, options.end, options.every) != (0, None, 1):
         raise InputError(
             "names one frame already", where=name, remedy="leave out --start, --end and --every"
         )
     else:
         view = open_view(name, format=options.format, camera=options.camera, topic=options.topic)
-        frame = view.frame
+        recording = Opening.of([path], options).open()
+        frame, is_clip = view.frame, False
     if frame is not None and kind_of(frame) == "cloud":
         return [_located_cloud(result, name, options, progress)]
     progress.stage("reading the map")
     index = ResultMap.read(result, options.threads, progress)
     progress.stage("locating")
-    if frame is not None and (recording is None or len(recording) == 1):
-        return [index.locate_frame(frame)]
-    assert recording is not None
-    return index.locate_clip(recording, progress)
+    if frame is None or is_clip:
+        return index.locate_clip(recording, progress)
+    return [index.locate_frame(frame, recording)]
 
 
 def _located_cloud(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,9 @@ from tofuse.apps.pairs.result import PairResult
 from tofuse.apps.report import fields, html, scene, thumbnails, words
 from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames import CloudFrame
+from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp import surface_shape
-from tofuse.formats.recordings import SingleView
 
 COLORS = {"source": (240, 160, 60), "target": (90, 176, 245)}
 MAX_POINTS = 45_000  # of each view; about 1 MB for both
@@ -22,7 +22,6 @@ _NEIGHBOURS = 30  # points of a local plane fit
 _MEDIANS_PER_CAP = 4.0  # the colour bar ends at this multiple of the median distance
 _OUTER = 2.0  # percentage at each end out of view: views thin out with the distance, unlike models
 _MAX_SPACINGS = 3.0  # of a point from its counterpart, along the surface
-_Z_UP = ("las", "e57", "ptx")  # formats of scanners and maps; cameras look along z
 
 
 def write_pair_report(result: PairResult, path: Path) -> None:
@@ -59,12 +58,11 @@ def write_pair_report(result: PairResult, path: Path) -> None:
 
 def pair_scene(result: PairResult) -> tuple[scene.Scene, fields.Field]:
     """Return both views, registered, y down, and the distance of each point from the other view."""
-    axes = np.eye(4)
-    if any(_is_z_up(view) for view in (result.source, result.target)):
-        axes[1:3, 1:3] = [[0, -1], [1, 0]]
     points, normals = [], []
     views = (result.source.frame, result.target.frame)
-    for frame, T in zip(views, (result.registration.T_target_source, np.eye(4)), strict=True):
+    poses = (result.registration.T_target_source, np.eye(4))
+    axes = _upright(views, poses)
+    for frame, T in zip(views, poses, strict=True):
         chosen = scene.random_subset(len(frame), MAX_POINTS)
         points.append(se3.transform(axes @ T, frame.points[chosen].astype(float)))
         directions = np.zeros((len(chosen), 3))
@@ -93,11 +91,16 @@ def pair_scene(result: PairResult) -> tuple[scene.Scene, fields.Field]:
     return drawn, fields.Field("distance", label, distance, 0.0, cap, ticks, (0.0, cap))
 
 
-def _is_z_up(view: SingleView) -> bool:
-    """Whether z is up: in maps, and with scanners, which measure in all directions."""
-    if not isinstance(view.frame, CloudFrame):
-        return False
-    return view.format in _Z_UP or view.frame.z_is_up
+def _upright(views: Sequence[Frame], poses: Sequence[Float64]) -> Float64:
+    """Return the pose (4, 4) of upright axes, y down, by the up direction of a view."""
+    for frame, T in zip(views[::-1], poses[::-1], strict=True):
+        up = frame.likely_up if isinstance(frame, CloudFrame) else None
+        if up is not None:
+            down = -T[:3, :3] @ up
+            across = np.cross(down, np.eye(3)[1 if abs(down[1]) < 0.9 else 2])
+            across /= np.linalg.norm(across)
+            return se3.pose(np.stack([across, down, np.cross(across, down)]))
+    return np.eye(4)
 
 
 def distances(points: Float64, others: Float64, normals: Float64, reach: float) -> Float64:

@@ -13,7 +13,7 @@ from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.clouds import AnyPair, NearOrigin, register_similar
 from tofuse.engine.compute import one_blas_thread
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, signals_as_themselves
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number, discover, name_of, registered
@@ -27,6 +27,7 @@ MAX_RISK = round(1 - pose_probability.ACCEPTED, 6)
 RISKS = Bounds(0, MAX_RISK)
 
 
+@signals_as_themselves()
 def register(
     source: View,
     target: View,

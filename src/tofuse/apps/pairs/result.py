@@ -145,7 +145,7 @@ def pair_json(result: PairResult) -> dict[str, Any]:
             "reference_point_m": result.source.frame.shift,
             **{name: getattr(registration, name) for name in _FIT},
             "seconds": round(result.seconds, 4),
-            "warnings": [*result.source.warnings, *result.target.warnings],
+            "warnings": [*dict.fromkeys((*result.source.warnings, *result.target.warnings))],
         }
     )
 

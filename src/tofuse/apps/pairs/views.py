@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.apps.results import folders, read_cloud
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds import MIN_POINTS
 from tofuse.engine.errors import InputError
@@ -84,7 +85,7 @@ def _checked(points: ArrayLike, name: str) -> Float64:
     if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
         kind = f" of shape {array.shape} and type {array.dtype}" if array.ndim else ""
         raise InputError(
-            f"is a {type(points).__name__}{kind}",
+            f"is {quantities.one(type(points).__name__)}{kind}",
             where=name,
             remedy="pass a frame (recording[0]), a result, a mesh, (N, 3) numbers in metres, or "
             "the path of one of these",

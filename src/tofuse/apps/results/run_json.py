@@ -13,6 +13,7 @@ import numpy as np
 
 from tofuse._version import __version__
 from tofuse.apps.results import integrity
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
@@ -293,7 +294,8 @@ def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
     times, poses = read_tum(folder / "trajectory.txt")
     problem = None
     if len(indices) != len(poses):
-        problem = f"lists {len(indices)} frames with a pose, but trajectory.txt has {len(poses)}"
+        posed = quantities.count(len(indices), "frame")
+        problem = f"lists {posed} with a pose, but trajectory.txt has {len(poses)}"
     elif not np.array_equal(times, stated):
         problem = "has other timestamps than trajectory.txt"
     if problem is not None:

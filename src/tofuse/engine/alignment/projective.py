@@ -282,6 +282,7 @@ def align(
     if len(images) > 1:  # kernels are compiled for one target, and for a few
         images += images[-1:] * (-len(images) % _FEW_TARGETS)
     T_targets = np.stack([t.T_target_world for t in targets])
+    sigma_ratio = _sigma_ratio(source, targets)
     T = T0.copy()
     iterations = 0
     for index, level in enumerate(options.levels):
@@ -298,6 +299,7 @@ def align(
             remap=index > 0,  # at the coarsest level the views are not yet aligned
             tilt=options.common_tilt,
             slope=options.common_slope,
+            sigma_ratio=sigma_ratio,
             max_sigma=options.constrained,
             prior=prior,
             units=UNITS,
@@ -331,6 +333,13 @@ def align(
             / max(len(points) * len(targets), 1)
         ),
     )
+
+
+def _sigma_ratio(source: PreparedView, targets: Sequence[Target]) -> float:
+    """Return the rms sigma of the source and its targets, relative to that of the source."""
+    others = sum(t.view.noise**2 for t in targets) / len(targets)
+    ratio = others / source.noise**2 if source.noise > 0 else 1.0
+    return math.sqrt(0.5 * (1 + ratio)) if math.isfinite(ratio) else 1.0
 
 
 def _initial_exposure(points: Float32, targets: Sequence[Target], T: Float64) -> float:

@@ -119,6 +119,8 @@ class LevelSettings(NamedTuple):
         2016).
     tilt, slope
         As in `spurious_information`.
+    sigma_ratio
+        Rms of the source's and the targets' sigmas of distances, relative to the source's.
     max_sigma
         As in `degenerate_directions`.
     prior, units
@@ -135,6 +137,7 @@ class LevelSettings(NamedTuple):
     remap: bool
     tilt: float
     slope: float
+    sigma_ratio: float
     max_sigma: float
     prior: Float64
     units: Float64
@@ -193,7 +196,7 @@ def iterate_level(
             spurious = total[res.INLIERS] * spurious_information(
                 points,
                 max(1, len(points) // SAMPLE_SIZE),
-                estimates[SCALE_G],
+                estimates[SCALE_G] * settings.sigma_ratio,
                 inflation,
                 estimates[SCALE_P] ** 2,
                 settings.tilt,

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float32, Float64, Int64
 from tofuse.engine.clouds import fpfh_kernels as kernels
 from tofuse.engine.clouds.robust_motion import (
@@ -190,7 +191,7 @@ def _described(
     points, normals = _on_surfaces(view, neighbours)
     if len(points) < min_points:
         raise RegistrationError(
-            f"has {len(points)} points on surfaces, too few to be matched",
+            f"has {quantities.count(len(points), 'point')} on surfaces, too few to be matched",
             where=f"frame {view.index}",
         )
     near = fpfh(points, normals, reach * size, signed)

@@ -9,6 +9,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.alignment import Registrar, Registration, UncertaintyOptions
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds.cloud_pair import follow_clouds, register_clouds, with_cloud_information
@@ -60,7 +61,9 @@ class AnyPair(Registrar):
         """
         for view in (source, target):
             if len(view) < MIN_POINTS:
-                raise RegistrationError(f"has {len(view)} points", where=f"frame {view.index}")
+                raise RegistrationError(
+                    f"has {quantities.count(len(view), 'point')}", where=f"frame {view.index}"
+                )
         source, target = _thinned(source), _thinned(target)
         searches = self.search or guess is None
         are_images = isinstance(source, RangeFrame) and isinstance(target, RangeFrame)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Float32
+from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 
 INVALID_DEPTH = 65535
@@ -25,12 +26,30 @@ def depth_from_numbers(numbers: NDArray[np.generic], unit_m: float) -> Float32:
     """Return depth in m (float32) of stored integers or floats (H, W) in units of `unit_m`.
 
     Depth that is not finite or implausibly large is 0, and so are integers that mark no depth.
+
+    Raises
+    ------
+    InputError
+        If all depth is negative.
     """
     with np.errstate(all="ignore"):
         depth = numbers.astype(np.float32) * np.float32(unit_m)
         depth[~(np.abs(depth) < se3.MAX_COORDINATE_M)] = 0
     depth[is_marked_invalid(numbers)] = 0
+    check_sign(numbers)
     return depth
+
+
+def check_sign(numbers: NDArray[Any], where: str | None = None) -> None:
+    """Raise InputError for negative depth (H, W), as of programs where z points backwards.
+
+    Integers, and a single negative value, may mark pixels without a measurement.
+    """
+    negative = numbers[numbers < 0]
+    is_measured = numbers.dtype.kind == "f" and len(negative) and negative.min() < negative.max()
+    if is_measured and not (numbers > 0).any():
+        problem, remedy = "holds negative depth only", "negate it, as z points forward"
+        raise InputError(problem, where=where, remedy=remedy)
 
 
 def is_marked_invalid(numbers: NDArray[Any]) -> NDArray[np.bool_]:

@@ -14,6 +14,7 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.cameras import Camera, depth_conversion, unknown_rays
@@ -109,7 +110,7 @@ class RangeFrame:
         where = f"frame {self.index}"
         if not isinstance(self.camera, Camera):
             raise InputError(
-                f"is a {type(self.camera).__name__}, not a camera",
+                f"is {quantities.one(type(self.camera).__name__)}, not a camera",
                 where=f"{where}: camera",
                 remedy="pass a camera, such as tofuse.Pinhole",
             )
@@ -262,6 +263,8 @@ class CloudFrame:
     shift
         (3,) m, to add to the points, and to the origin, to get the coordinates of their file. Not
         zero for map coordinates, which exceed the precision of float32; of whole metres.
+    up
+        (3,) unit vector upwards in the frame of the points, where the format states it; or None.
     """
 
     index: int
@@ -273,6 +276,7 @@ class CloudFrame:
     color: UInt8 | None = None
     origin: Float64 = field(default_factory=lambda: np.zeros(3))
     shift: Float64 = field(default_factory=lambda: np.zeros(3))
+    up: Float64 | None = None
 
     def __post_init__(self) -> None:
         _check_frame(self)
@@ -307,6 +311,7 @@ class CloudFrame:
         index: int = 0,
         timestamp: float = 0.0,
         origin: Float64 | None = None,
+        up: Float64 | None = None,
         **columns: NDArray[Any] | None,
     ) -> Self:
         """Make a view of points (N, 3) in m, in any coordinates, dropping invalid ones.
@@ -319,6 +324,8 @@ class CloudFrame:
             Frame index, and s.
         origin
             (3,) m, in the coordinates of the points; None for their origin.
+        up
+            (3,) unit vector upwards; None where not known.
         columns
             `normals`, `amplitude` and `color` of all points.
         """
@@ -339,7 +346,7 @@ class CloudFrame:
             array = array[valid]
             columns = {name: v if v is None else v[valid] for name, v in columns.items()}
         origin = (np.zeros(3) if origin is None else origin) - shift
-        values: dict[str, Any] = {**columns, "origin": origin, "shift": shift}
+        values: dict[str, Any] = {**columns, "origin": origin, "shift": shift, "up": up}
         return cls(index, timestamp, array.astype(np.float32), **values)
 
     @property
@@ -361,13 +368,16 @@ class CloudFrame:
         return ranges
 
     @property
-    def z_is_up(self) -> bool:
-        """Whether z is up: in map coordinates, and if the sensor measured in all directions.
+    def likely_up(self) -> Float64 | None:
+        """(3,) upwards: as stated; z in map coordinates, and of a sensor that measures all around.
 
-        Cameras look along z.
+        None for others, as cameras look along z.
         """
+        if self.up is not None:
+            return self.up
         behind = float((self.points[:, 2] < self.origin[2]).mean()) if len(self) else 0.0
-        return bool(self.shift.any()) or _MIN_BEHIND <= behind <= 1 - _MIN_BEHIND
+        z_is_up = self.shift.any() or _MIN_BEHIND <= behind <= 1 - _MIN_BEHIND
+        return np.array([0.0, 0.0, 1.0]) if z_is_up else None
 
     def relative_to(self, shift: Float64) -> Self:
         """Return the view with another `shift` (3,), m, of the same coordinates of the file."""

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.cameras import Camera, Pinhole, RayTable, pinhole_values
-from tofuse.engine.errors import InputError
-from tofuse.engine.frames.depth_counts import is_marked_invalid
+from tofuse.engine.errors import InputError, signals_as_themselves
+from tofuse.engine.frames.depth_counts import check_sign, is_marked_invalid
 from tofuse.engine.frames.frames import AmplitudeKind, DepthKind, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
@@ -26,6 +27,7 @@ _MILLIMETRES = 1e-3
 _MAX_MEDIAN_M = 200.0
 
 
+@signals_as_themselves()
 def from_arrays(
     depth: ArrayLike | Sequence[ArrayLike],
     camera: Camera | ArrayLike,
@@ -170,7 +172,10 @@ def _optional(
     shape = images[0].shape if channels is None else (*images[0].shape, channels)
     converted = _images(name, values, shape)
     if len(converted) != len(images):
-        raise InputError(f"contains {len(converted)} images, and depth {len(images)}", where=name)
+        raise InputError(
+            f"contains {quantities.count(len(converted), 'image')}, and depth {len(images)}",
+            where=name,
+        )
     wrong = [image.dtype for image in converted if image is not None and image.dtype != np.uint8]
     if dtype is np.uint8 and wrong:
         raise InputError(f"is {wrong[0]}", where=name, remedy="use uint8, from 0 to 255")
@@ -195,7 +200,9 @@ def _to_metres(
 
     def to_metres(image: NDArray[Any]) -> Float64:
         metres = image.astype(np.float64) * scale
-        return np.where(is_marked_invalid(image), 0.0, metres)
+        metres[is_marked_invalid(image)] = 0
+        check_sign(image, "depth")
+        return metres
 
     return to_metres
 
@@ -217,7 +224,7 @@ def _camera(camera: Camera | ArrayLike, shape: tuple[int, ...], count: int) -> C
         K = np.asarray(camera, float)
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"is a {type(camera).__name__}, neither a camera nor a matrix",
+            f"is {quantities.one(type(camera).__name__)}, neither a camera nor a matrix",
             where="camera",
             remedy="pass K (3, 3), or a camera such as tofuse.Pinhole",
         ) from error

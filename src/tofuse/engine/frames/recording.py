@@ -12,6 +12,7 @@ from typing import Any, Protocol, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.compute import job_pool
 from tofuse.engine.errors import InputError, UnreadableFrameError, shown
@@ -143,7 +144,7 @@ class Recording:
         return _opened_again, (self.opened[1], self.indices)
 
     def __repr__(self) -> str:
-        return f"Recording: {len(self)} frames of {self.path} ({self.format})"
+        return f"Recording: {quantities.count(len(self), 'frame')} of {self.path} ({self.format})"
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -213,7 +214,7 @@ class Recording:
         indices = self.indices[slice(start, end, every)]
         if len(indices) == 0:
             raise InputError(
-                f"has {len(self)} frames, of which the selection leaves none",
+                f"has {quantities.count(len(self), 'frame')}, of which the selection leaves none",
                 where=self.path,
                 remedy="change --start, --end or --every",
             )

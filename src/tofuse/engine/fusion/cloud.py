@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Int64, UInt8
 from tofuse.engine.compute import thread_count
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
@@ -61,7 +62,7 @@ class Cloud(Exportable):
         return len(self.points)
 
     def __repr__(self) -> str:
-        return f"Cloud: {len(self):,} points over {self.diagonal_m:.3g} m"
+        return f"Cloud: {quantities.count(len(self), 'point')} over {self.diagonal_m:.3g} m"
 
     def record(self) -> GeometryRecord:
         """See `Exportable.record`."""

@@ -16,6 +16,7 @@ from typing import Annotated, ClassVar, Protocol
 import numpy as np
 from scipy.special import chdtri
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.frames import evenly_spaced
@@ -243,7 +244,7 @@ class GravityEdges(Bounded, ExternalSensor):
         if count == 0:
             return SensorPriors()
         if count < _MIN_FRAMES:
-            text = f"only {count} frames measure gravity, {_MIN_FRAMES} are needed"
+            text = f"gravity in only {quantities.count(count, 'frame')}, {_MIN_FRAMES} are needed"
             return SensorPriors(records=(SensorRecord("gravity", count, 0, None, text),))
         measured = sensed.gravity[rows].copy()
         measured[:, 3] = np.hypot(measured[:, 3], self.shared_rad)

@@ -8,6 +8,7 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.alignment import Registration
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.errors import InputError
@@ -109,7 +110,9 @@ class PoseGraph:
 
     def __repr__(self) -> str:
         return (
-            f"PoseGraph: {len(self.ids)} poses, {len(self.edges)} edges ({self.loop.sum()} loops)"
+            f"PoseGraph: {quantities.count(len(self.ids), 'pose')}, "
+            f"{quantities.count(len(self.edges), 'edge')} "
+            f"({quantities.count(int(self.loop.sum()), 'loop')})"
         )
 
     @classmethod

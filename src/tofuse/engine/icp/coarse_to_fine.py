@@ -8,6 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float32, Float64, Intp
 from tofuse.engine.bounds import Bounded, Bounds
@@ -86,7 +87,8 @@ class CoarseToFine(Bounded, Registrar):
         for view in (source, target):
             if len(view) < MIN_PAIRS:
                 raise RegistrationError(
-                    f"has {len(view)} points, {MIN_PAIRS} are needed", where=f"frame {view.index}"
+                    f"has {quantities.count(len(view), 'point')}, {MIN_PAIRS} are needed",
+                    where=f"frame {view.index}",
                 )
         if self.resolution is None:
             finest = self.finest(source, target, max(spacing(source), spacing(target)))

@@ -11,6 +11,7 @@ from typing import Annotated
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
@@ -200,7 +201,8 @@ class Icp(Bounded, Registrar):
         points = Points.of(view, selector.select(view, rng), self.neighbours)
         if len(points) < _MIN_POINTS:
             raise RegistrationError(
-                f"has {len(points)} points, {_MIN_POINTS} are needed", where=f"frame {view.index}"
+                f"has {quantities.count(len(points), 'point')}, {_MIN_POINTS} are needed",
+                where=f"frame {view.index}",
             )
         return points
 

@@ -12,6 +12,7 @@ from typing import Annotated
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import RegistrationError
@@ -175,7 +176,8 @@ class PointToPoint(interfaces.Metric):
         """
         if len(matches) < 3:
             raise RegistrationError(
-                f"only {len(matches)} points of the views correspond, 3 are needed"
+                f"the views have only {quantities.count(len(matches), 'corresponding point')}, "
+                "3 are needed"
             )
         d0, m0, H, size = icp_kernels.weighted_moments(
             alignment.transformed,

@@ -11,6 +11,7 @@ from typing import Annotated, Literal, Protocol
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute import tukey_kernels as tukey
@@ -125,10 +126,11 @@ def surface_pairs(matches: Matches, alignment: Alignment, *, source: bool = Fals
     source_normals = alignment.source.normals[i] if source else np.zeros((len(i), 3))
     weight = matches.weights() * _noise_weights(matches, alignment)
     valid = np.isfinite(target_normals).all(1) & np.isfinite(source_normals).all(1) & (weight > 0)
-    if np.count_nonzero(valid) < MIN_PAIRS:
+    paired = int(np.count_nonzero(valid))
+    if paired < MIN_PAIRS:
         raise RegistrationError(
-            f"only {np.count_nonzero(valid)} points of the views correspond and have normals, "
-            f"{MIN_PAIRS} are needed",
+            f"the views have only {quantities.count(paired, 'corresponding point')} "
+            f"with normals, {MIN_PAIRS} are needed",
             remedy="pass views of a common surface; few points, or points on a line, have none",
         )
     centre = p[valid].mean(0)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from tofuse.engine import parts
+from tofuse.engine import parts, quantities
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters import Filter
@@ -116,7 +116,7 @@ def checked(config: Any) -> Config:
     """Return the configuration, or raise InputError if it is none."""
     if not isinstance(config, Config):
         raise InputError(
-            f"is a {type(config).__name__}, not a configuration",
+            f"is {quantities.one(type(config).__name__)}, not a configuration",
             where="config",
             remedy='pass the name of one, such as "default", or a dictionary of options',
         )

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.alignment import Link
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError, InputWarning
@@ -197,8 +198,8 @@ class FrameLog:
             if np.nanmedian(depths) > _FAR_M:
                 remedy = f"depth must be in m; here it is {np.nanmedian(depths):.0f} m on average"
             raise InputError(
-                f"none of the {len(entries)} frames has enough valid points for a pose"
-                f" (first: {entries[0].record.reason})",
+                f"has {quantities.count(len(entries), 'frame')}, none with enough valid points "
+                f"for a pose (first: {entries[0].record.reason})",
                 where="the recording",
                 remedy=remedy,
             )

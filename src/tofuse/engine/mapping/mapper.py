@@ -11,6 +11,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.compute import ahead, thread_count, threads, trim_memory
@@ -351,7 +352,7 @@ class Mapper:
         self._check_open()
         if not isinstance(frame, RangeFrame | CloudFrame):
             raise InputError(
-                f"is a {type(frame).__name__}, not a frame",
+                f"is {quantities.one(type(frame).__name__)}, not a frame",
                 where="frame",
                 remedy="pass a RangeFrame or a CloudFrame",
             )
@@ -361,7 +362,7 @@ class Mapper:
             if isinstance(frame, CloudFrame):
                 self.config = configured(self._given, kind)
                 self._shift = frame.shift
-                self._up = np.array([0.0, 0.0, 1.0]) if frame.z_is_up else None
+                self._up = frame.likely_up
                 self._prior_loops = tuple(p.about(-self._shift) for p in self._prior_loops)
                 self._start_method()
             check_views(self.config, kind)
@@ -389,7 +390,9 @@ def prior_loops(
     """
     if not isinstance(loops, Sequence) or isinstance(loops, str):
         raise InputError(
-            f"is a {type(loops).__name__}", where="loops", remedy="pass a list of pairs (i, j)"
+            f"is {quantities.one(type(loops).__name__)}",
+            where="loops",
+            remedy="pass a list of pairs (i, j)",
         )
     found = tuple(PriorLoop.of(loop) for loop in loops)
     for index in (index for loop in found for index in (loop.i, loop.j)):

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import POSES_BY, Frame, Recording
@@ -149,7 +150,8 @@ def _track(
         unreadable = push_frames(mapper, recording, config.window)
     if len(unreadable) == len(recording):
         raise InputError(
-            f"none of the {len(recording)} frames can be read (first: {unreadable[0]})",
+            f"has {quantities.count(len(recording), 'frame')}, none of which can be read "
+            f"(first: {unreadable[0]})",
             where=recording.path,
             remedy="check that the files are complete, or use --format",
         )

@@ -27,6 +27,7 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.compute import run_all
@@ -281,7 +282,7 @@ def map_consistency(
     T = np.asarray(poses, float)
     if T.shape != (len(recording), 4, 4):
         raise InputError(
-            f"have shape {T.shape}, for {len(recording)} frames",
+            f"have shape {T.shape}, for {quantities.count(len(recording), 'frame')}",
             where="poses",
             remedy="pass one pose per frame",
         )

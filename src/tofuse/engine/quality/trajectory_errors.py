@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
@@ -263,7 +264,9 @@ def _times(times: ArrayLike, poses: Float64, name: str) -> Float64:
     t = np.asarray(times, float)
     if t.shape != (len(poses),):
         raise InputError(
-            f"has {t.size} times for {len(poses)} poses", where=name, remedy="pass one per pose"
+            f"has {t.size} times for {quantities.count(len(poses), 'pose')}",
+            where=name,
+            remedy="pass one per pose",
         )
     return np.where(np.isfinite(poses).all((1, 2)), t, np.nan)
 

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Bool, Float32, Float64
 from tofuse.engine.frames import frame_ranges
 from tofuse.engine.fusion import Cloud, Mesh, T_up_world
@@ -177,7 +178,9 @@ class Diagnostics:
 
     def __repr__(self) -> str:
         codes = [reason.code for reason in self.reasons]
-        return ", ".join((f"Diagnostics: {self.verdict}", f"{len(self.frames)} frames", *codes))
+        return ", ".join(
+            (f"Diagnostics: {self.verdict}", quantities.count(len(self.frames), "frame"), *codes)
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -43,6 +44,8 @@ _MIN_DEPTH, _MAX_DEPTH = 1e-3, 1e3
 # Lower limit of the noise relative to the depth, for views that are averaged or simulated without
 # noise.
 _MIN_NOISE = 3e-4
+# The median noise of a view is that of every n-th pixel of every n-th row.
+_NOISE_STEP = 4
 # Half width of the box filter of the albedo, pixels.
 _ALBEDO_RADIUS = 1
 
@@ -179,6 +182,13 @@ class PreparedView:
         """Median z in m; 1 without valid pixels."""
         valid = self.z[self.z > 0]
         return median(valid) if len(valid) else 1.0
+
+    @cached_property
+    def noise(self) -> float:
+        """Median standard deviation of the planes, relative to z; 0 without a plane."""
+        w = self.planes[::_NOISE_STEP, ::_NOISE_STEP, 3]
+        variance = self.plane_variance[::_NOISE_STEP, ::_NOISE_STEP][w > 0]
+        return math.sqrt(median(variance / w[w > 0] ** 2)) if len(variance) else 0.0
 
     @cached_property
     def target(self) -> Float32:

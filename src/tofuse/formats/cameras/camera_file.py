@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError
@@ -253,7 +254,7 @@ def camera_fields(camera: Camera) -> dict[str, Any]:
         return {"model": "rays", "width": camera.width, "height": camera.height}
     if not isinstance(camera, Pinhole):
         raise InputError(
-            f"is a {type(camera).__name__}",
+            f"is {quantities.one(type(camera).__name__)}",
             where="camera",
             remedy="use one of the models, or a RayTable of its rays",
         )
@@ -344,7 +345,8 @@ def _lens(get: _Fields) -> tuple[Pinhole | None, tuple[int, int]]:
     if any(extra):
         raise get.error(
             "distortion",
-            f"has {len(coefficients)} numbers, the model {model!r} takes {len(order)}",
+            f"has {quantities.count(len(coefficients), 'number')}, "
+            f"the model {model!r} takes {len(order)}",
             f"use [{' '.join(order)}], or another model",
         )
     values |= {name: float(v) for name, v in zip(order, coefficients, strict=False)}

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import UInt8
 from tofuse.engine.cameras import Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError, UnreadableFrameError
@@ -99,7 +100,7 @@ def _write(recording: Recording, folder: Path) -> tuple[int, list[str]]:
         raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
     _finish(recording, writer, written, correction)
     if writer.out_of_range:
-        warnings.append(f"{writer.out_of_range} values were too large for 16 bits")
+        warnings.append(f"{quantities.count(writer.out_of_range, 'value')} too large for 16 bits")
     if any(isinstance(f, CloudFrame) and f.origin.any() for f in sample):
         warnings.append("the sensor's position within its clouds is lost")
     if NOISE_MODEL in recording.metadata:
@@ -301,7 +302,9 @@ def _write_layout(recording: Recording, folder: Path, layout: Layout) -> tuple[i
         raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
     if out_of_range:
         farthest = depth_counts.MAX_COUNTS / COUNTS_PER_M[layout]
-        warnings.append(f"{out_of_range} pixels beyond {farthest:.1f} m don't fit, and are dropped")
+        warnings.append(
+            f"{quantities.count(out_of_range, 'pixel')} beyond {farthest:.1f} m left out"
+        )
     finish = _finish_tum if layout == "tum" else _finish_open3d
     finish(recording, folder, rectifier.pinhole, written)
     return len(written), warnings

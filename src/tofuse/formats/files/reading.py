@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 
@@ -82,7 +83,9 @@ def path_of(value: object, name: str, remedy: str) -> Path:
         If it is no path.
     """
     if not isinstance(value, str | os.PathLike):
-        raise InputError(f"is a {type(value).__name__}, not a path", where=name, remedy=remedy)
+        raise InputError(
+            f"is {quantities.one(type(value).__name__)}, not a path", where=name, remedy=remedy
+        )
     if not str(value) or "\0" in str(value):
         raise InputError(f"is {str(value)!r}, not a path", where=name, remedy=remedy)
     return Path(value)

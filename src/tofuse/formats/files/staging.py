@@ -156,7 +156,7 @@ def new_folder(path: str | Path) -> Iterator[Path]:
     OutputError
         If `path` exists and is not an empty folder, or can't be written.
     """
-    with replacing_folder(path, check_new) as folder:
+    with replacing_folder(path, lambda _folder: check_new(path)) as folder:
         yield folder
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.formats.files.atomic import write_text
@@ -17,11 +18,28 @@ from tofuse.formats.files.reading import read_text
 # As separators, commas are not mixed with others: "1,5 2,5" and "1,5;2,5" are two numbers each.
 _DECIMAL_COMMA = re.compile(r"\b([0-9]+,[0-9]+)[ \t;]+[-+]?[0-9]+,[0-9]")
 
+# NaN and infinity as C libraries of Windows print them, in older ones rounded like digits: 1.#QNAN
+# with 3 decimals is 1.#QO. Infinite measurements are missing, too.
+_NOT_FINITE = re.compile(
+    r"(?<![\w.])[-+]?(?:nan\((?:ind|snan)\)|1\.(?:\$|#(?:[QS]NAN|IN[DF]|[QS]NB|[IQS]O|[JRT])0*))(?!\w)",
+    re.IGNORECASE,
+)
+
+
+def plain_nan(text: str) -> str:
+    """Return numbers as text with the non-finite ones of programs on Windows written as nan.
+
+    >>> plain_nan("-nan(ind) 1.#QNAN00 -1.#IO 1.5")
+    'nan nan nan 1.5'
+    """
+    return _NOT_FINITE.sub("nan", text) if any(mark in text for mark in "#($") else text
+
 
 def parse_numbers(text: str, path: str | Path, *, skip: int = 0) -> Float64:
     """Parse rows of numbers, (N, C).
 
     Separators are blanks, commas and semicolons; '#' and '//' (of CloudCompare) start a comment.
+    For missing values see `plain_nan`.
 
     Parameters
     ----------
@@ -37,6 +55,7 @@ def parse_numbers(text: str, path: str | Path, *, skip: int = 0) -> Float64:
     InputError
         If a cell is not a number, decimals are written with commas, or rows have different lengths.
     """
+    text = plain_nan(text)
     if "," in text and (decimal := _DECIMAL_COMMA.search(text)):
         raise InputError(
             f"writes numbers with commas ({decimal.group(1)})",
@@ -91,7 +110,8 @@ def read_columns(path: str | Path) -> dict[str, Float64]:
     InputError
         If there is no header, a name is repeated, or a row has another length.
     """
-    rows = [line.split(",") for line in read_text(path).splitlines() if line.strip()]
+    text = plain_nan(read_text(path))
+    rows = [line.split(",") for line in text.splitlines() if line.strip()]
     if not rows:
         raise InputError("is empty", where=path, remedy="write a line of column names first")
     names = [name.strip().lstrip("#").strip() for name in rows[0]]
@@ -103,7 +123,8 @@ def read_columns(path: str | Path) -> dict[str, Float64]:
     for k, row in enumerate(rows[1:]):
         if len(row) != len(names):
             raise InputError(
-                f"has {len(row)} cells in row {k + 1} and {len(names)} column names",
+                f"has {quantities.count(len(row), 'cell')} in row {k + 1} "
+                f"and {len(names)} column names",
                 where=path,
                 remedy="add a cell for each column to each row",
             )

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.formats.files import atomic, reading
+from tofuse.formats.files import atomic, reading, tables
 from tofuse.formats.geometry.ply import stacked
 
 MAX_POINTS = 1 << 28
@@ -200,14 +201,15 @@ def _compressed(body: memoryview, header: _Header) -> list[NDArray[Any]]:
 
 
 def _ascii(body: memoryview, header: _Header) -> list[NDArray[Any]]:
-    lines = [line for line in bytes(body).decode("latin-1").splitlines() if line.strip()]
+    text = tables.plain_nan(bytes(body).decode("latin-1"))
+    lines = [line for line in text.splitlines() if line.strip()]
     if len(lines) < header.points:
         raise _truncated(header)
     total = sum(header.counts)
     try:
         table = np.loadtxt(lines[: header.points], ndmin=2, comments=None)
         if header.points and table.shape[1] != total:
-            raise ValueError(f"{table.shape[1]} numbers per row, not {total}")
+            raise ValueError(f"{quantities.count(table.shape[1], 'number')} per row, not {total}")
     except (ValueError, OverflowError) as error:
         reason = str(error).split("; use")[0]
         raise InputError(f"contains damaged points ({reason})") from error

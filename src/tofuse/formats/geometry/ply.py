@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float32, Int32, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.formats.files import atomic, reading
+from tofuse.formats.files import atomic, reading, tables
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
@@ -237,7 +238,8 @@ class _Ascii:
     """Reads elements sequentially from the lines of a text body."""
 
     def __init__(self, body: bytes) -> None:
-        self.lines = [line for line in body.decode("latin-1").splitlines() if line.strip()]
+        text = tables.plain_nan(body.decode("latin-1"))
+        self.lines = [line for line in text.splitlines() if line.strip()]
         self.offset = 0
 
     def element(self, element: _Element) -> _Columns:
@@ -251,7 +253,9 @@ class _Ascii:
             width = len(element.properties)
             table = np.loadtxt(lines, ndmin=2) if lines else np.zeros((0, width))
             if table.shape[1] < width:
-                raise ValueError(f"{table.shape[1]} numbers per row, not {width}")
+                raise ValueError(
+                    f"{quantities.count(table.shape[1], 'number')} per row, not {width}"
+                )
             with np.errstate(invalid="ignore", over="ignore"):
                 return {
                     p.name: table[:, k].astype(p.dtype) for k, p in enumerate(element.properties)

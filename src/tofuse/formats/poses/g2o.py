@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError, InputWarning
 from tofuse.engine.geometry import quaternion
@@ -131,7 +132,7 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> None:
 def _numbers(words: list[str], ids: int, count: int) -> tuple[list[int], list[float]]:
     if len(words) != 1 + ids + count:
         raise InputError(
-            f"{words[0]} has {len(words) - 1} numbers, not {ids + count}",
+            f"{words[0]} has {quantities.count(len(words) - 1, 'number')}, not {ids + count}",
             remedy="write the whole line",
         )
     try:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
@@ -74,7 +75,7 @@ def _from_numbers(text: str, path: str | Path) -> Float64:
     if len(numbers) == 16:
         return np.array(numbers).reshape(4, 4)
     if len(numbers) not in (7, 8):
-        raise InputError(f"contains {len(numbers)} numbers")
+        raise InputError(f"contains {quantities.count(len(numbers), 'number')}")
     row = np.array(numbers[-7:])
     norm = float(quaternion.length(row[3:]))
     if abs(norm - 1) > 0.1:
@@ -115,7 +116,7 @@ def read_loops(path: str | Path, frames: Collection[int] | None = None) -> list[
 def _loop(words: list[str]) -> PriorLoop:
     form = "write 'i j' or 'i j tx ty tz qx qy qz qw'"
     if len(words) not in (2, 9):
-        raise InputError(f"has {len(words)} values", remedy=form)
+        raise InputError(f"has {quantities.count(len(words), 'value')}", remedy=form)
     try:
         i, j = (int(word) for word in words[:2])
         values = np.array([float(word) for word in words[2:]])

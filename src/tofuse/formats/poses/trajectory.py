@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
@@ -58,7 +59,9 @@ def numbers_of_rows(
             raise InputError(str(error), where=where) from error
         if len(cells) < count or (exactly and len(cells) > count):
             needed = f"{count}" if exactly else f"{count} or more"
-            raise InputError(f"has {len(cells)} numbers, not {needed}", where=where)
+            raise InputError(
+                f"has {quantities.count(len(cells), 'number')}, not {needed}", where=where
+            )
     return np.array(table, float).reshape(-1, count), [number for number, _ in rows]
 
 

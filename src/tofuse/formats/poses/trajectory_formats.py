@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
@@ -153,7 +154,10 @@ def _reader(rows: _Rows, *, with_commas: bool) -> _Reader:
         return _euroc
     if count == 8:
         return _tum
-    raise InputError(f"is not a trajectory of a known format: its first line has {count} columns")
+    raise InputError(
+        "is not a trajectory of a known format: its first line has "
+        f"{quantities.count(count, 'column')}"
+    )
 
 
 def _is_number(cell: str) -> bool:
@@ -212,7 +216,7 @@ def _kitti(rows: _Rows, path: Path) -> TimedPoses:
 def _log(rows: _Rows, path: Path) -> TimedPoses:
     """A line of three numbers, the first the frame, and four of a matrix, for each pose."""
     if len(rows) % 5:
-        raise InputError(f"has {len(rows)} lines, not 5 for each pose")
+        raise InputError(f"has {quantities.count(len(rows), 'line')}, not 5 for each pose")
     poses, frames = [], []
     for k in range(0, len(rows), 5):
         _, head = rows[k]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64, UInt8, UInt16
 from tofuse.engine.cameras import Camera, Rational, RayTable
 from tofuse.engine.errors import InputError
@@ -130,7 +131,9 @@ class AzureKinectSource(FileSource):
         offset = _integer(self.file.tags.get("K4A_START_OFFSET_NS"))
         super().__init__((np.array([b.time_ns for b in self.depth]) + offset) / 1e9)
         if not self.file.complete:
-            self.warnings.append(f"{path} is cut off: {len(self.depth)} frames remain")
+            self.warnings.append(
+                f"{path} is cut off after {quantities.count(len(self.depth), 'frame')}"
+            )
         limit = (depth.duration_ns or 33_333_333) / 2e9
         self.infrared = self._matched_blocks(tracks.get("IR"), limit, 0)
         color = tracks.get("COLOR")

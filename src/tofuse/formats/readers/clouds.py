@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError
@@ -104,7 +105,11 @@ def xyz_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     text = reading.read_text(path)
     table = tables.parse_numbers(text, path, skip=int(_has_head(text)))
     if table.shape[1] < 3:
-        raise InputError(f"has {table.shape[1]} numbers per line", where=path, remedy="write x y z")
+        raise InputError(
+            f"has {quantities.count(table.shape[1], 'number')} per line",
+            where=path,
+            remedy="write x y z",
+        )
     normals = color = None
     if table.shape[1] >= 6:
         first = 4 if path.suffix.lower() == ".pts" and table.shape[1] == 7 else 3
@@ -121,7 +126,7 @@ def xyz_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
 
 def _has_head(text: str) -> bool:
     """Whether the first line is a number of points, or names of columns."""
-    cells = text.split("\n", 1)[0].replace(",", " ").replace(";", " ").split()
+    cells = tables.plain_nan(text.split("\n", 1)[0]).replace(",", " ").replace(";", " ").split()
     with suppress(IndexError, ValueError):
         float(cells[0])
         return len(cells) == 1
@@ -172,7 +177,7 @@ def scan_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     first = text.split("\n", 1)[0].split()
     table = tables.parse_numbers(text, path, skip=int(len(first) == 1))
     if table.shape[1] < 3:
-        raise InputError(f"has {table.shape[1]} numbers per line", where=path)
+        raise InputError(f"has {quantities.count(table.shape[1], 'number')} per line", where=path)
     with np.errstate(over="ignore"):
         points = table[:, :3] * np.diag(FLIP) * CENTIMETRE
     # The scanner writes (0, 0, 0) for missing measurements.
@@ -186,7 +191,9 @@ def read_pose(path: Path) -> Float64:
     numbers = tables.read_numbers(path).ravel()
     if len(numbers) != 6 or not np.isfinite(numbers).all():
         raise InputError(
-            f"has {len(numbers)} numbers", where=path, remedy="write x y z and three angles"
+            f"has {quantities.count(len(numbers), 'number')}",
+            where=path,
+            remedy="write x y z and three angles",
         )
     (sx, sy, sz), (cx, cy, cz) = np.sin(np.radians(numbers[3:])), np.cos(np.radians(numbers[3:]))
     # Rx Ry Rz, as EulerToMatrix4 of 3DTK.

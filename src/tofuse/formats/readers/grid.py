@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float32
 from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import InputError
@@ -177,8 +178,9 @@ class _Frames:
             or np.count_nonzero(on_ray) < _MIN_ON_RAYS * len(on_ray)
         ):
             raise InputError(
-                f"has {len(points)} points, not {self.raster.width} x {self.raster.height}, and "
-                "they are not on the rays of the previous files",
+                f"has {quantities.count(len(points), 'point')}, "
+                f"not {self.raster.width} x {self.raster.height}, "
+                "and they are not on the rays of the previous files",
                 remedy="export all points, including invalid ones",
             )
         image = np.full((count, 3), np.nan, np.float32)

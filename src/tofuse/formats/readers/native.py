@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import Camera, Pinhole
 from tofuse.engine.errors import InputError
@@ -225,7 +226,7 @@ class NativeSource(FileSource):
             return []
         files = reading.files_with(folder, *suffixes)
         if len(files) != len(self.files):
-            raise self._count_error(folder, f"{len(files)} images")
+            raise self._count_error(folder, quantities.count(len(files), "image"))
         if [f.stem for f in files] == [f.stem for f in self.files]:
             return files
         # Numbers from another first one shift all names that both have, others are of other frames.
@@ -256,7 +257,7 @@ class NativeSource(FileSource):
         columns = tables.read_columns(path)
         length = len(next(iter(columns.values())))
         if rows is not None and length != rows:
-            raise self._count_error(path, f"{length} rows")
+            raise self._count_error(path, quantities.count(length, "row"))
         return columns
 
     def _read_gravity(self) -> None:
@@ -275,7 +276,8 @@ class NativeSource(FileSource):
 
     def _count_error(self, where: Path, count: str) -> InputError:
         return InputError(
-            f"has {count}, {self.files[0].parent.name}/ has {len(self.files)} files",
+            f"has {count}, {self.files[0].parent.name}/ has "
+            f"{quantities.count(len(self.files), 'file')}",
             where=where,
             remedy="make the counts agree, or remove it",
         )

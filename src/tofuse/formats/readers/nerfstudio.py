@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float32, Float64, UInt8
 from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths, scaled
 from tofuse.engine.errors import InputError
@@ -95,7 +96,9 @@ class NerfstudioSource(FileSource):
         if all("depth_path" in frame.entry for frame in self.frames):
             self.metadata[POSES_BY] = "NeRFCapture"
         if without_depth:
-            self.warnings.append(f"{file}: {without_depth} frames have no depth: skipped")
+            self.warnings.append(
+                f"{file}: {quantities.count(without_depth, 'frame')} without depth: skipped"
+            )
         if not timed:
             self.warnings.append(f"{file}: no timestamps: frame numbers serve as seconds")
         self.reference = inputs.poses_of(self, self.frames, _Frame.pose)

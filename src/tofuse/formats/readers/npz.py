@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, RayTable, pinhole_values
 from tofuse.engine.errors import InputError
@@ -187,7 +188,11 @@ class NpzSource(FileSource):
             return np.arange(count) / rate
         times = self._floats(arrays, "timestamps").ravel()
         if len(times) != count:
-            raise self._error("timestamps", f"has {len(times)} values", f"save {count}, as depth")
+            raise self._error(
+                "timestamps",
+                f"has {quantities.count(len(times), 'value')}",
+                f"save {count}, as depth",
+            )
         return times
 
     def _poses(self, arrays: dict[str, NDArray[Any]], name: str) -> Float64 | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
@@ -25,7 +26,7 @@ class Pairs(Reader):
         files = reading.files_named(path, _DEPTH.fullmatch)
         if not files:
             return None
-        evidence = f"{len(files)} images like {files[0].name}"
+        evidence = f"{quantities.count(len(files), 'image')} like {files[0].name}"
         if reading.is_file(path / "camera.json"):
             return Sniff(1.0, f"{evidence} and camera.json")
         remedy = "use --format pairs with --camera camera.json, which states lens and depth_unit_m"

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame
@@ -62,7 +64,8 @@ class _Scan:
         table = tables.parse_numbers(text, self.file)
         if len(table) != self.count or table.shape[1] not in (4, 7):
             raise InputError(
-                f"has {len(table)} lines of {table.shape[1]} numbers, not {self.count} of 4 or 7",
+                f"has {quantities.count(len(table), 'line')} of {table.shape[1]} numbers, "
+                f"not {self.count} of 4 or 7",
                 where=self.file,
                 remedy="copy or export the file again",
             )
@@ -72,7 +75,11 @@ class _Scan:
             color = np.nan_to_num(table[:, 4:]).clip(0, 255).astype(np.uint8)
         scalars = {"intensity": cloud_files.to_float32(table[:, 3])}
         cloud = GeometryRecord(points, color=color, scalars=scalars)
-        return cloud_files.cloud_frame(index, timestamp, cloud)
+        pose = None
+        with suppress(InputError):  # reported when the file is opened
+            pose = self.pose()
+        up = cloud_files.up_in_scan(pose)
+        return cloud_files.cloud_frame(index, timestamp, cloud, up=up)
 
 
 def _scans(path: Path) -> list[_Scan]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
@@ -168,8 +169,8 @@ def color_files(
     if any(matches):
         return matches
     warnings.append(
-        f"{folder.name}/ has {len(color)} images, depth/ {len(files)}, and their names don't show "
-        "which belong together: colour is ignored"
+        f"{folder.name}/ has {quantities.count(len(color), 'image')}, depth/ {len(files)}, "
+        "and their names don't show which belong together: colour is ignored"
     )
     return None
 

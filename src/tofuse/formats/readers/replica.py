@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.parts import part
@@ -53,7 +54,8 @@ class Replica(Reader):
             table = tables.read_numbers(path / _POSES)
             if table.shape != (len(table), 16) or len(table) <= int(numbers[-1]):
                 raise InputError(
-                    f"has {len(table)} lines of {table.shape[-1]} numbers, not 16 for each frame",
+                    f"has {quantities.count(len(table), 'line')} of {table.shape[-1]} numbers, "
+                    "not 16 for each frame",
                     where=path / _POSES,
                     remedy="download it again, or remove it",
                 )

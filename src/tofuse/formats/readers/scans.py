@@ -161,7 +161,7 @@ def _las_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     color = color if color is not None and color.any() else None
     scalars = {"intensity": intensity} if intensity.any() else {}
     cloud = GeometryRecord(xyz, color=color, scalars=scalars)
-    return cloud_files.cloud_frame(index, timestamp, cloud)
+    return cloud_files.cloud_frame(index, timestamp, cloud, up=cloud_files.up_in_scan())
 
 
 @part("reader", "e57")
@@ -227,7 +227,9 @@ class E57Source(FileSource):
             color = color.astype(np.uint8)
         scalars = {"intensity": data["intensity"]} if "intensity" in data else {}
         cloud = GeometryRecord(points, color=color, scalars=scalars)
-        return cloud_files.cloud_frame(index, float(index), cloud)
+        pose = None if self.reference is None else self.reference[index]
+        up = cloud_files.up_in_scan(pose)
+        return cloud_files.cloud_frame(index, float(index), cloud, up=up)
 
     def _pose(self, header: Any) -> Float64:
         if not header.has_pose():

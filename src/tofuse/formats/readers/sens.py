@@ -11,6 +11,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64, UInt8, UInt16
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_counts
@@ -162,7 +163,7 @@ class SensSource(FileSource):
             except zlib.error as error:
                 raise InputError(f"has damaged depth ({error})") from error
         if len(data) != expected:
-            raise InputError(f"has {len(data)} bytes of depth, not {expected}")
+            raise InputError(f"has {quantities.count(len(data), 'byte')} of depth, not {expected}")
         return np.frombuffer(data, "<u2").reshape(height, width)
 
     def _color(self, data: bytes, where: str) -> UInt8:
@@ -171,7 +172,7 @@ class SensSource(FileSource):
         if self.color_packing != RAW:
             return as_color(parse_image(data, where, size=size))
         if len(data) != 3 * size[0] * size[1]:
-            raise InputError(f"has {len(data)} bytes", where=where)
+            raise InputError(f"has {quantities.count(len(data), 'byte')}", where=where)
         return np.frombuffer(data, np.uint8).reshape(size[1], size[0], 3)
 
     def _take(self, file: BinaryIO, count: int) -> bytes:

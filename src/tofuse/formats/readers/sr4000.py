@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import part
-from tofuse.formats.files import reading
+from tofuse.formats.files import reading, tables
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, pixels
 
 FRAME_RATE_HZ = 32.0
@@ -90,7 +91,9 @@ class Sr4000Source(FileSource):
             self.timestamps = np.arange(len(times)) / FRAME_RATE_HZ
             return
         if missing:
-            self.warnings.append(f"{missing} frames have no timestamp: interpolated")
+            self.warnings.append(
+                f"{quantities.count(missing, 'frame')} without a timestamp: interpolated"
+            )
         times = inputs.interpolated(times)
         # Frames stay in sequence where the camera's counter restarts.
         step = np.diff(times, prepend=times[0])
@@ -140,7 +143,7 @@ def _time_stamp(path: Path) -> float:
 def _read_blocks(path: Path) -> dict[str, Float64]:
     """Return the (H, W) blocks of a file by short name."""
     blocks: dict[str, Float64] = {}
-    for section in reading.read_text(path).split("%")[1:]:
+    for section in tables.plain_nan(reading.read_text(path)).split("%")[1:]:
         title, _, body = section.partition("\n")
         name = _BLOCKS.get(title.strip().lower())
         if name is None:

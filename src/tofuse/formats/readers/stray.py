@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64, Intp, UInt8
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
@@ -137,7 +138,8 @@ class StraySource(phones.PhoneSource):
         if not valid.any():
             raise nothing
         if not valid.all():
-            self.warnings.append(f"{path}: {int((~valid).sum())} frames have no row: interpolated")
+            without = quantities.count(int((~valid).sum()), "frame")
+            self.warnings.append(f"{path}: {without} without a row: interpolated")
         self.timestamps = inputs.interpolated(times)
         poses = np.full((len(row), 4, 4), np.nan)
         table = np.stack([columns[name] for name in _POSE], 1)[row]

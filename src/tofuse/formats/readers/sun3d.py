@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64, UInt16
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
@@ -94,7 +95,7 @@ def _reference(path: Path, color: list[Path | None], warnings: list[str]) -> Flo
         if table.shape != (3 * len(images), 4):
             raise InputError(
                 f"has {len(table)} rows of {table.shape[-1]} numbers, not 3 rows of 4 for each of "
-                f"{len(images)} images",
+                f"{quantities.count(len(images), 'image')}",
                 where=files[-1],
             )
     except InputError as error:

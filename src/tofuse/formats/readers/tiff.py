@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import RangeFrame, depth_counts
 from tofuse.engine.parts import part
@@ -70,8 +71,8 @@ class TiffSource(FileSource):
         self.ambiguity_m = description.ambiguity_m
         if self.amplitude and len(self.amplitude) != len(self.depth):
             self.warnings.append(
-                f"{len(self.amplitude)} images of amplitude for {len(self.depth)} of depth: "
-                "left out"
+                f"{quantities.count(len(self.amplitude), 'image')} of amplitude "
+                f"for {len(self.depth)} of depth: left out"
             )
             self.amplitude = []
         self.read_sidecars(folder)

@@ -6,10 +6,12 @@ import atexit
 import shutil
 import stat
 import tempfile
+import warnings
 import zipfile
+import zlib
 from pathlib import Path, PurePosixPath
 
-from tofuse.engine.errors import SHOWN_AS, InputError
+from tofuse.engine.errors import SHOWN_AS, InputError, InputWarning
 from tofuse.formats.files import reading
 
 _REMEDY = "unpack it yourself, and pass the folder"
@@ -49,6 +51,7 @@ def unzipped(path: str | Path) -> Path:
 def _unpack(path: Path) -> Path:
     """Unpack an archive into a new folder, for which messages name the archive."""
     with reading.library_errors(path), zipfile.ZipFile(path) as archive:
+        _check_whole(archive, path)
         members = _checked(archive.infolist(), path)
         folder = Path(tempfile.mkdtemp(prefix="tofuse-"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
@@ -60,9 +63,35 @@ def _unpack(path: Path) -> Path:
                 remedy=_REMEDY,
             )
         SHOWN_AS[str(folder / path.name)] = str(path)
-        for member in members:
-            archive.extract(member, folder / path.name)
+        damaged = [m.filename for m in members if not _extracted(archive, m, folder / path.name)]
+    if len(damaged) == len(members):
+        raise InputError("is damaged", where=path, remedy="copy the file again")
+    if damaged:
+        more = f" and {len(damaged) - 1} more" if damaged[1:] else ""
+        warnings.warn(
+            f"{path}: {damaged[0]}{more} can't be unpacked and will be empty; copy it again",
+            InputWarning,
+            stacklevel=3,
+        )
     return folder / path.name
+
+
+def _extracted(archive: zipfile.ZipFile, member: zipfile.ZipInfo, folder: Path) -> bool:
+    """Unpack one file of an archive; a damaged one becomes empty, which its reader reports."""
+    try:
+        archive.extract(member, folder)
+    except (zipfile.BadZipFile, zlib.error, EOFError):
+        (folder / member.filename).write_bytes(b"")
+        return False
+    return True
+
+
+def _check_whole(archive: zipfile.ZipFile, path: Path) -> None:
+    """Reject a part of an archive, where the directory is that of another archive in it (.npz)."""
+    first = min((member.header_offset for member in archive.infolist()), default=0)
+    with path.open("rb") as file:
+        if first > 0 and file.read(4) == b"PK\3\4":
+            raise InputError("is cut off before its end", where=path, remedy="copy the file again")
 
 
 def _checked(members: list[zipfile.ZipInfo], path: Path) -> list[zipfile.ZipInfo]:

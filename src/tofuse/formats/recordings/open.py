@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.errors import InputError, UnreadableFrameError, signals_as_themselves
 from tofuse.engine.frames import NOISE_MODEL, CloudFrame, Frame, RangeFrame, Recording, Source
 from tofuse.engine.parts import check_number, discover, name_of, registered
 from tofuse.formats.cameras import read_noise
@@ -50,10 +51,14 @@ _ARCHIVES = {".zip", ".tar", ".gz", ".tgz", ".7z", ".rar"}
 
 # A single file of these, which contain a whole recording, is that of its folder.
 _CONTAINERS = (".bag", ".db3", ".mcap", ".mkv", ".sens", ".r3d", ".npz", ".h5", ".e57")
-# What to do with scans that are not read, by suffix.
-_CLOUDS = dict.fromkeys(
-    (".txt", ".csv"), "if the lines are x y z of a cloud, rename the files to .xyz"
-)
+# What to do with files that are not read, by suffix.
+_REMEDIES = {
+    **dict.fromkeys(
+        (".txt", ".csv"), "if the lines are x y z of a cloud, rename the files to .xyz"
+    ),
+    ".npy": "save depth and K by numpy.savez, or put a file for each image into depth/ beside a "
+    "camera.json (docs/formats.md)",
+}
 
 # A folder with these may contain depth images of an unknown camera.
 _IMAGES = (".png", ".pgm", ".tif", ".tiff", ".jpg", ".jpeg")
@@ -65,6 +70,7 @@ def readers() -> dict[str, Reader]:
     return {name: cls() for name, cls in registered("reader").items()}
 
 
+@signals_as_themselves()
 def open_recording(
     *paths: str | Path,
     format: str | None = None,  # noqa: A002
@@ -352,7 +358,7 @@ def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) ->
         evidence = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(4))
         problem = f"is not a recording of a known format: it contains {evidence}"
         most = kinds.most_common(1)[0][0] if kinds else ""
-        remedy = _CLOUDS.get(most.lower(), remedy)
+        remedy = _REMEDIES.get(most.lower(), remedy)
         if any(kind.lower() in _IMAGES for kind in kinds):
             remedy = "if these are depth images, move them to depth/ in it and add a camera.json"
     elif path.stat().st_size == 0:
@@ -360,7 +366,7 @@ def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) ->
     else:
         kind = f"a {path.suffix!r} file" if path.suffix else "a file without a suffix"
         problem = f"is not a recording of a known format, but {kind}"
-        remedy = _CLOUDS.get(path.suffix.lower(), remedy)
+        remedy = _REMEDIES.get(path.suffix.lower(), remedy)
     folder = path.absolute().parent
     if _is_sure(folder):
         return InputError(problem, where=path, remedy=f"pass the recording's folder, {folder}")
@@ -589,7 +595,7 @@ def open_view(
     count = len(recording)
     if index is None and count > 1:
         raise InputError(
-            f"contains {count} frames",
+            f"contains {quantities.count(count, 'frame')}",
             where=name,
             remedy=f"choose one: {name}#0 to {name}#{count - 1}",
         )

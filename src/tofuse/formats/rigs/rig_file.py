@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
@@ -99,7 +100,8 @@ class Rig:
         if self.unplaced:
             remedy += f", and none of {', '.join(self.unplaced)}, whose pose was not found"
         raise InputError(
-            f"has {len(self.cameras)} cameras ({names}), and {count} recordings are given",
+            f"has {quantities.count(len(self.cameras), 'camera')} ({names}), "
+            f"and {count} recordings are given",
             where=where,
             remedy=remedy,
         )

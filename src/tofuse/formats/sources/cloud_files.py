@@ -37,7 +37,12 @@ def to_float32(values: NDArray[Any]) -> Float32:
 
 
 def cloud_frame(
-    index: int, timestamp: float, cloud: GeometryRecord, *, origin: Float64 | None = None
+    index: int,
+    timestamp: float,
+    cloud: GeometryRecord,
+    *,
+    origin: Float64 | None = None,
+    up: Float64 | None = None,
 ) -> CloudFrame:
     """Return a cloud of a file as a view, without invalid points; see `CloudFrame.of`."""
     return CloudFrame.of(
@@ -45,10 +50,21 @@ def cloud_frame(
         index=index,
         timestamp=timestamp,
         origin=origin,
+        up=up,
         normals=cloud.normals,
         amplitude=cloud.amplitude,
         color=cloud.color,
     )
+
+
+def up_in_scan(T_map_scan: Float64 | None = None) -> Float64:
+    """Return the unit vector (3,) upwards in a scan of a format of surveyors: z of the map is up.
+
+    Scanners stand upright: without a pose (4, 4), it is z of the scan.
+    """
+    if T_map_scan is None or not np.isfinite(T_map_scan).all():
+        return np.array([0.0, 0.0, 1.0])
+    return T_map_scan[2, :3]
 
 
 LoadFrame = Callable[[Path, int, float], Frame]

@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
@@ -117,7 +118,9 @@ def poses_of(
             errors.append(error)
         poses.append(np.full((4, 4), np.nan) if pose is None else pose)
     if errors:
-        source.warnings.append(f"{len(errors)} poses can't be read, the first: {errors[0]}")
+        source.warnings.append(
+            f"{quantities.count(len(errors), 'pose')} can't be read, the first: {errors[0]}"
+        )
     return np.stack(poses) if np.isfinite(poses).any() else None
 
 
@@ -136,7 +139,7 @@ def read_matrix_pose(table: Float64, where: str) -> Float64:
     """
     if table.shape != (4, 4):
         raise InputError(
-            f"has {table.shape[0]} rows of {table.shape[-1]} numbers",
+            f"has {quantities.count(table.shape[0], 'row')} of {table.shape[-1]} numbers",
             where=where,
             remedy="write the pose as four rows of four numbers",
         )
@@ -164,7 +167,8 @@ def read_timestamps(path: Path, count: int, warnings: list[str]) -> Float64:
     table = tables.read_numbers(path)
     if table.shape != (count, 1):
         raise InputError(
-            f"has {len(table)} lines of {table.shape[-1]} numbers for {count} frames",
+            f"has {quantities.count(len(table), 'line')} of {table.shape[-1]} numbers for "
+            f"{quantities.count(count, 'frame')}",
             where=path,
             remedy="use one time in seconds for each frame, or remove it",
         )
