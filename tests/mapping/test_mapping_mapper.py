@@ -319,6 +319,12 @@ def test_clouds_all_around_have_z_up(frames) -> None:
     np.testing.assert_allclose(result.T_up_world[1, :3], [1, 0, 0], atol=0.02)
 
 
+@pytest.mark.parametrize("up", [np.zeros(3), np.full(3, np.nan), [0.0, 1.0], [0.0, 0.0, 9.81]])
+def test_up_direction_of_cloud_is_a_unit_vector(up) -> None:
+    with pytest.raises(InputError, match=r"frame 0: up: .*unit vector"):
+        CloudFrame(0, 0.0, np.zeros((4, 3), np.float32), up=up)
+
+
 def test_given_tracker_tracks_clouds_too(frames) -> None:
     """An interrupted run goes on with one that repeats what was tracked."""
     clouds = [CloudFrame.of(f.points[::6], index=f.index, timestamp=f.index) for f in frames[:2]]

@@ -28,3 +28,4 @@ def test_all_is_not_claimed_for_less():
 def test_nouns_agree_with_numbers_and_articles():
     assert [count(n, "frame") for n in (0, 1, 12_000)] == ["0 frames", "1 frame", "12,000 frames"]
     assert [one(noun) for noun in ("int", "list", "ndarray")] == ["an int", "a list", "an ndarray"]
+    assert [one(noun) for noun in ("uint8", "OrderedDict")] == ["a uint8", "an OrderedDict"]

@@ -33,8 +33,8 @@ def probability(value: float | None) -> str:
 
 
 def one(noun: str) -> str:
-    """Return a noun with its indefinite article, by its sound: "a list", "an int", "an ndarray"."""
-    return f"{'an' if noun.startswith(('a', 'e', 'i', 'o', 'u', 'nd')) else 'a'} {noun}"
+    """Return a noun with its indefinite article, by its sound: "an int", "a uint8"."""
+    return f"{'an' if noun.lower().startswith(('a', 'e', 'i', 'o', 'nd')) else 'a'} {noun}"
 
 
 def count(number: int, noun: str) -> str:

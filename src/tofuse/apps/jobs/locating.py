@@ -289,6 +289,7 @@ def _located_in(
     folders.check_result(result)
     path, number = split_name(name)
     frame: Frame | None
+    recording: Recording | None
     if number is None:
         recording = Opening.of([path], options).open()
         check_one_camera(recording)
@@ -300,15 +301,15 @@ def _located_in(
         )
     else:
         view = open_view(name, format=options.format, camera=options.camera, topic=options.topic)
-        recording = Opening.of([path], options).open()
-        frame, is_clip = view.frame, False
+        frame, recording, is_clip = view.frame, view.recording, False
     if frame is not None and kind_of(frame) == "cloud":
         return [_located_cloud(result, name, options, progress)]
     progress.stage("reading the map")
     index = ResultMap.read(result, options.threads, progress)
     progress.stage("locating")
-    if frame is None or is_clip:
+    if recording is not None and (frame is None or is_clip):
         return index.locate_clip(recording, progress)
+    assert frame is not None
     return [index.locate_frame(frame, recording)]
 
 

@@ -45,9 +45,10 @@ def check_sign(numbers: NDArray[Any], where: str | None = None) -> None:
 
     Integers, and a single negative value, may mark pixels without a measurement.
     """
+    if numbers.dtype.kind != "f" or (numbers > 0).any():
+        return
     negative = numbers[numbers < 0]
-    is_measured = numbers.dtype.kind == "f" and len(negative) and negative.min() < negative.max()
-    if is_measured and not (numbers > 0).any():
+    if len(negative) and negative.min() < negative.max():
         problem, remedy = "holds negative depth only", "negate it, as z points forward"
         raise InputError(problem, where=where, remedy=remedy)
 

@@ -28,6 +28,8 @@ AmplitudeKind = Literal["raw", "range_compensated", "ir"]
 SATURATED_AMPLITUDE = 65535.0
 # Minimum fraction of points behind the origin that excludes a camera.
 _MIN_BEHIND = 0.1
+# Largest difference of the length of a direction from 1.
+_MAX_UNIT_ERROR = 0.1
 
 
 # Names of all images of a `RangeFrame`, which have one size.
@@ -300,6 +302,12 @@ class CloudFrame:
             if np.shape(place) != (3,) or not np.isfinite(place).all():
                 problem = f"is {place!r}, not three finite numbers"
                 raise InputError(problem, where=f"frame {self.index}: {name}", remedy="use metres")
+        if self.up is not None and not (
+            np.shape(self.up) == (3,) and abs(np.linalg.norm(self.up) - 1) < _MAX_UNIT_ERROR
+        ):
+            raise InputError(
+                f"is {self.up!r}", where=f"frame {self.index}: up", remedy="pass a unit vector (3,)"
+            )
         columns = {name: getattr(self, name) for name in COLUMNS}
         _check_columns(self.index, len(self.points), columns)
 
@@ -374,7 +382,7 @@ class CloudFrame:
         None for others, as cameras look along z.
         """
         if self.up is not None:
-            return self.up
+            return np.asarray(self.up, np.float64)
         behind = float((self.points[:, 2] < self.origin[2]).mean()) if len(self) else 0.0
         z_is_up = self.shift.any() or _MIN_BEHIND <= behind <= 1 - _MIN_BEHIND
         return np.array([0.0, 0.0, 1.0]) if z_is_up else None

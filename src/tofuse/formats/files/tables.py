@@ -24,6 +24,8 @@ _NOT_FINITE = re.compile(
     r"(?<![\w.])[-+]?(?:nan\((?:ind|snan)\)|1\.(?:\$|#(?:[QS]NAN|IN[DF]|[QS]NB|[IQS]O|[JRT])0*))(?!\w)",
     re.IGNORECASE,
 )
+# Without these, which are found much faster, there is none.
+_MARKS = "1.#", "1.$", "n(", "N("
 
 
 def plain_nan(text: str) -> str:
@@ -32,7 +34,7 @@ def plain_nan(text: str) -> str:
     >>> plain_nan("-nan(ind) 1.#QNAN00 -1.#IO 1.5")
     'nan nan nan 1.5'
     """
-    return _NOT_FINITE.sub("nan", text) if any(mark in text for mark in "#($") else text
+    return _NOT_FINITE.sub("nan", text) if any(mark in text for mark in _MARKS) else text
 
 
 def parse_numbers(text: str, path: str | Path, *, skip: int = 0) -> Float64:

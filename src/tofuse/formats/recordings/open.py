@@ -558,6 +558,8 @@ class SingleView:
         The view.
     warnings
         Notes for the user on how it was read.
+    recording
+        That of the frame, if it has one.
     """
 
     name: str
@@ -566,6 +568,7 @@ class SingleView:
     index: int
     frame: Frame
     warnings: tuple[str, ...] = ()
+    recording: Recording | None = None
 
 
 def open_view(
@@ -606,7 +609,7 @@ def open_view(
     frame, warnings = recording[index], tuple(recording.warnings)
     if file_axes and "stored_axes" in recording.metadata and isinstance(frame, RangeFrame):
         frame, warnings = organised.stored_cloud(frame), ()
-    return _checked(SingleView(name, path, recording.format, index, frame, warnings))
+    return _checked(SingleView(name, path, recording.format, index, frame, warnings, recording))
 
 
 def _checked(view: SingleView) -> SingleView:
