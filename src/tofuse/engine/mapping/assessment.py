@@ -311,8 +311,11 @@ class Assessment:
         if refinement.calibration_check is not None:
             calibration = camera_uncertainty.pose_errors(refinement.calibration_check, corrections)
         split = refinement.split_m, refinement.split_rad
+        depth_m = float(np.median(self._depths)) if self._depths else 0.0
+        positions = refined.graph.poses[:, :3, 3]
+        range_m = pose_accuracy.error_by_range(positions, refinement.shared, depth_m)
         return pose_accuracy.ObservedErrors(
-            *moved, excess_m, *calibration, *split, corrected=bool(corrections)
+            *moved, excess_m, *calibration, *split, range_m, corrected=bool(corrections)
         )
 
     def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:

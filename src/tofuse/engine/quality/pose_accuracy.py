@@ -18,7 +18,7 @@ from functools import partial
 import numpy as np
 from scipy.special import bdtrc, chdtri, fdtri
 
-from tofuse.engine.alignment import projective
+from tofuse.engine.alignment import UncertaintyOptions, projective
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.compute import run_all
 from tofuse.engine.frames import evenly_spaced
@@ -28,6 +28,8 @@ from tofuse.engine.stored_views import PosedView
 from tofuse.engine.views import PreparedView
 
 _LEVEL = 0.95
+# Error that all patches of a view have in common, relative to the rest.
+_COMMON = UncertaintyOptions().offset
 # Evenly spaced poses that the rms is computed from, and the least certain ones in addition.
 _EVENLY_SPACED, _WORST = 50, 10
 # Standard deviations of an unmeasured direction, practically unbounded: m and rad.
@@ -142,6 +144,8 @@ class ObservedErrors:
         Rms error of the poses due to the calibration of the camera.
     split_m, split_rad
         Rms errors by halves of the images, see `split_half`: those of the covariance and more.
+    range_m
+        Rms error by errors of the range that differ from place to place, see `error_by_range`.
     corrected
         Whether the camera was corrected by its own views: halves share the correction's error.
     """
@@ -153,6 +157,7 @@ class ObservedErrors:
     calibration_rad: float = 0.0
     split_m: float = 0.0
     split_rad: float = 0.0
+    range_m: float = 0.0
     corrected: bool = False
 
     @property
@@ -185,7 +190,38 @@ class ObservedErrors:
             "refinement": UNKNOWN_FRACTION * np.array([self.moved_m, self.moved_rad]) ** 2,
             "disagreement": UNKNOWN_FRACTION * np.array([self.excess_m, 0.0]) ** 2,
             "calibration": np.array([self.calibration_m, self.calibration_rad]) ** 2,
+            "range": np.array([self.range_m, 0.0]) ** 2,
         }
+
+
+def error_by_range(positions: Float64, shared: float, depth_m: float) -> float:
+    """Return the rms error of positions by errors of the range that differ from place to place, m.
+
+    Multipath depends on where the camera is. Where its error grows as the camera approaches a
+    surface, by a fraction of the way, all views agree on a way that is longer by this fraction.
+    Only the part that differs between patches of the images leaves residuals. The part that all
+    patches of a view have in common is taken to be larger by the same factor as in the covariance
+    of a single alignment, and to change with the place over about the depth: the error of the
+    distance of two poses is the integral of a random field with an exponential correlation. As it
+    is one of the place, and not of the path, a loop does not show it.
+
+    Parameters
+    ----------
+    positions
+        (N, 3) of the poses, m.
+    shared
+        See `Refinement.shared`.
+    depth_m
+        Typical depth, m.
+    """
+    if not shared or not depth_m:
+        return 0.0
+    some = positions[evenly_spaced(np.arange(len(positions)), _EVENLY_SPACED)] / depth_m
+    distances = np.linalg.norm(some[:, None] - some, axis=2)
+    # Twice the double integral of exp(-|s - t|) over the distance; half of it is the mean square
+    # deviation from the mean position.
+    squares = distances - 1 + np.exp(-distances)
+    return _COMMON * shared * depth_m * float(np.sqrt(squares.mean()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -476,7 +512,8 @@ def scale_of_registrations(
     if by_covariance is None:
         return 1.0, 1.0
     causes = observed.mean_squares(by_covariance.squares)
-    ratio = _ratio(causes["noise"] + causes["calibration"], by_covariance.squares)
+    of_camera = causes["noise"] + causes["calibration"] + causes["range"]
+    ratio = _ratio(of_camera, by_covariance.squares)
     translation, rotation = np.sqrt(np.maximum(ratio, 1.0)).tolist()
     return translation, rotation
 

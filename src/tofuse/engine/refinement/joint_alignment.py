@@ -137,6 +137,9 @@ class Refined:
         Exposures and scales of the pairs in both directions.
     shared
         Variances of errors that patches share, for `support_of`, if they are modelled.
+    shared_growth
+        Variance of these errors at growth 1, see `shared_error`: relative to the depth, for a
+        change of the viewpoint of 1 rad. 0 if they are not modelled.
     """
 
     poses: Float64
@@ -150,6 +153,7 @@ class Refined:
     information: Float64
     scales: pair_equations.KnownScales
     shared: Float64 | None = None
+    shared_growth: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,13 +238,13 @@ def refine(
     pairs = aligned.pairs
     by_patch, last = not calibrate and state.depends_on_patches, options.rounds[-1]
     state.evaluate(poses, errors, fixed_errors, last, by_patch=by_patch)
-    shared = state.shared_variance(poses) if by_patch else None
+    shared, growth = state.shared_variance(poses) if by_patch else (None, 0.0)
     after = _support(state, shared)
     measured = _pairwise_measurements(poses, pairs, state)
     state.evaluate(start, np.zeros_like(errors), fixed_errors, last)
     before = _support(state)
-    moved, scales = aligned.moved, state.known_scales
-    return Refined(poses, start, errors, pairs, moved, before, after, *measured, scales, shared)
+    found = poses, start, errors, pairs, aligned.moved, before, after, *measured
+    return Refined(*found, state.known_scales, shared, growth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,7 +322,7 @@ def align_views(
             by_patch = is_last and state.depends_on_patches
             state.evaluate(poses, errors, fixed_errors, stage, by_patch=by_patch)
             if by_patch:
-                state.discount_shared(state.shared_variance(poses))
+                state.discount_shared(state.shared_variance(poses)[0])
             known = errors, usual
             step, error_step = _solve(poses, state, system, fixed_errors, known, priors, bodies)
             factor, earlier_error_step = _extrapolation(error_step, earlier_error_step)

@@ -57,7 +57,8 @@ _ERROR_INDEX: dict[CameraError, int] = {
 
 
 # Errors of the camera, and (m, rad) of the poses by halves of the images.
-_Evaluation = tuple[CalibrationCheck, tuple[float, float]]
+# The check of the camera; errors by halves of the images (m, rad), and `Refinement.shared`.
+_Evaluation = tuple[CalibrationCheck, tuple[float, float, float]]
 _Views = Sequence[PosedView[PreparedView]]
 
 
@@ -88,6 +89,10 @@ class Refinement:
         Pairs (i, j) of edges that do not come from the overlap of the two views.
     split_m, split_rad
         Rms errors of the poses by halves of the images (`split_half`); 0 unless kept.
+    shared
+        Rms depth error that patches of the images share, as far as it differs between them:
+        relative to the depth, for a change of the viewpoint of 1 rad (`shared_error`); 0 unless
+        kept.
     pattern
         Depth errors that are fixed to the camera, if there are any, and the poses are kept.
     """
@@ -105,6 +110,7 @@ class Refinement:
     non_overlap_edges: tuple[tuple[int, int], ...] = ()
     split_m: float = 0.0
     split_rad: float = 0.0
+    shared: float = 0.0
     pattern: fixed_pattern.FixedPattern = fixed_pattern.NONE
 
     @property
@@ -264,12 +270,13 @@ class _Joint(Refiner):
         if support_fell(gain):  # the camera may be the cause
             return replace(unchanged, calibration_check=calibration)
         after = with_unsupported_views_fixed(before, refined.poses, gain < -MAX_LOSS)
-        split_m, split_rad = _mean_errors([split for _, split in evaluated])
+        split_m, split_rad, shared = _mean_errors([errors for _, errors in evaluated])
         return replace(
             unchanged.accepted(positions, after),
             calibration_check=calibration,
             split_m=split_m,
             split_rad=split_rad,
+            shared=shared,
             errors={name: float(refined.errors[_ERROR_INDEX[name]]) for name in options.calibrate},
             edges=pairwise_measurements([p.index for p in posed], refined),
             pattern=pattern,
@@ -330,11 +337,11 @@ class _Joint(Refiner):
 
     def _evaluate(self, submap: RefinedViews) -> _Evaluation:
         """Evaluate a submap while its views are in memory."""
-        split = split_half_errors(submap)
+        errors = *split_half_errors(submap), float(np.sqrt(submap.refined.shared_growth))
         if not self._error_indices:
-            return check_calibration(submap), split
+            return check_calibration(submap), errors
         gap = loop_gap(submap, submap.refined.poses, submap.refined.errors)
-        return CalibrationCheck(gap=gap), split
+        return CalibrationCheck(gap=gap), errors
 
     def _coarse(self, posed: PosedView[PreparedView]) -> SpilledCoarseView:
         surface = _surface(posed)
@@ -345,10 +352,10 @@ class _Joint(Refiner):
         return SampledView.of(_surface(posed), self._options.alignment.points)
 
 
-def _mean_errors(errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Root mean squares of errors (m, rad); 0 without any."""
-    m, rad = np.sqrt((np.reshape(errors, (-1, 2)) ** 2).sum(0) / max(len(errors), 1)).tolist()
-    return m, rad
+def _mean_errors(errors: Sequence[tuple[float, float, float]]) -> list[float]:
+    """Root mean squares of three errors; 0 without any."""
+    squares = np.reshape(errors, (-1, 3)) ** 2
+    return np.sqrt(squares.sum(0) / max(len(errors), 1)).tolist()
 
 
 def _surface(posed: PosedView[PreparedView]) -> PreparedView:

@@ -57,6 +57,7 @@ _CAUSES = {
     "refinement": "the correction by the refinement: a return to the start would confirm it",
     "disagreement": "surfaces that differ between views, by multipath or changes of the scene",
     "calibration": "the camera's calibration: a better one would remove it",
+    "range": "ranges that are wrong by different amounts in different places, as by multipath",
 }
 
 

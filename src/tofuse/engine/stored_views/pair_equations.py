@@ -254,8 +254,8 @@ class DirectedPairs:
         """
         return self.options.shared > 0 and bool((self.scale_p > 0).any())
 
-    def shared_variance(self, poses: Float64) -> Float64:
-        """Return the (P,) variances of depth errors that patches share, m^2.
+    def shared_variance(self, poses: Float64) -> tuple[Float64, float]:
+        """Return the (P,) variances of depth errors that patches share, m^2, and that at growth 1.
 
         `poses` (N, 4, 4) are those of the last `evaluate` with `by_patch`. See `shared_error`.
         """
@@ -273,7 +273,7 @@ class DirectedPairs:
         )
         at_growth_1 = self.options.shared**2 * disagreement.variance(growth[sampled_rows])
         variance[photometric] = at_growth_1 * growth
-        return variance
+        return variance, at_growth_1
 
     def discount_shared(self, variance: Float64) -> None:
         """Remove what errors explain that patches share, from the equations and the residuals.
