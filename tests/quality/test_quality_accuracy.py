@@ -122,9 +122,39 @@ def test_errors_shown_by_recording_are_added_as_variances() -> None:
         assert one.limited_by == cause
         assert one.rotation_rad == plain.rotation_rad
     assert bound_of(moved_rad=0.1).rotation_rad > plain.rotation_rad
+    assert bound_of(range_m=0.2).position_m == pytest.approx(camera.position_m)
+    assert bound_of(range_m=0.2).rotation_rad == plain.rotation_rad
     C = covariances_of(GraphCovariances(walk()), ObservedErrors(0.03, 0.02, 0.04))
     np.testing.assert_array_equal(C[0], 0)
     assert np.trace(C[5, :3, :3]) > 0.05**2 / 3
+
+
+def test_poses_far_apart_share_less_of_an_error_of_the_range() -> None:
+    """Of poses within the depth all distances are wrong by the same fraction."""
+    depth, shared = 2.0, 0.005
+    line = np.outer(np.linspace(0, 1, 40), [0.6, 0.0, 0.8])
+    deviation = float(np.linalg.norm(line - line.mean(0), axis=1).mean())
+    near = accuracy.error_by_range(0.01 * line, shared, depth)
+    rms = float(np.sqrt(((line - line.mean(0)) ** 2).sum(1).mean()))
+    assert near == pytest.approx(accuracy._COMMON * shared * 0.01 * rms, rel=0.01)
+    assert near > accuracy._COMMON * shared * 0.01 * deviation
+    # Over ten depths: sums of a random fraction that is correlated over the depth.
+    rng, step = np.random.default_rng(3), 20.0 / 39
+    apart = np.abs(np.subtract.outer(np.arange(39), np.arange(39))) * step
+    root = np.linalg.cholesky(np.exp(-apart / depth))
+    found = []
+    for _ in range(2000):
+        sums = np.append(0.0, np.cumsum(step * (root @ rng.standard_normal(39))))
+        found.append(sums.var())
+    far = accuracy.error_by_range(20 * line, shared, depth)
+    expected = accuracy._COMMON * shared * float(np.sqrt(np.mean(found)))
+    assert far == pytest.approx(expected, rel=0.05)
+    assert far < 0.7 * accuracy._COMMON * shared * 20 * rms
+    # A camera that comes back has no more of it, and one that only turns has none.
+    back = np.concatenate([line, line[::-1]])
+    assert accuracy.error_by_range(20 * back, shared, depth) == pytest.approx(far, rel=0.02)
+    assert accuracy.error_by_range(0 * line, shared, depth) == 0
+    assert accuracy.error_by_range(line, 0.0, depth) == 0
 
 
 def noise_m() -> float:

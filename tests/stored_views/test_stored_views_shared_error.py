@@ -171,6 +171,19 @@ def test_albedo_weighs_more_with_shared_errors():
     assert allowed < 0.92 * without
 
 
+def test_refinement_states_the_size_of_shared_errors():
+    """Relative to the depth and to the change of the viewpoint."""
+    found = []
+    for size in (0.0, 0.005, 0.01):
+        views, truth = bent_views(1, size)
+        found.append(refine(views, truth, RefineOptions()).shared_growth ** 0.5)
+    none, small, large = found
+    assert none < 0.2 * large
+    assert small == pytest.approx(large / 2, rel=0.25)
+    views, truth = bent_views(1, 0.01, lit=False)
+    assert refine(views, truth, RefineOptions()).shared_growth == 0
+
+
 def test_pixels_are_not_discounted_without_shared_errors_or_albedo():
     views, truth = bent_views(1, 0.0)
     some, none = (refine(views, truth, RefineOptions(shared=s)).poses for s in (1.0, 0.0))
