@@ -185,6 +185,26 @@ def test_moving_objects_are_excluded_unless_ignored(room, moving):
         assert not any(step.moved or step.rival for step in steps)
 
 
+def test_what_comes_in_behind_the_front_of_an_object_moves_too(room):
+    """As somebody's body behind an arm: since the arm came, none has seen behind both."""
+    frames, poses, noise = room
+    tracker, steps = Keyframes().start(0), []
+    for n, frame in enumerate(frames):
+        x = 0.9 - 0.1 * n
+        made, _ = with_box(frame, np.array([x, 0, 0.7]), np.array([0.05, 0.6, 0.05]), noise, n)
+        body = np.array([x + 0.35, 0, 1.0])
+        made, behind = with_box(made, body, np.array([0.2, 0.6, 0.1]), noise, n)
+        steps.append((tracker.push(made), behind))
+    for n in range(11, 16):  # the body fills half of the image
+        step, behind = steps[n]
+        assert step.moving is not None
+        assert (step.moving & behind).sum() > 0.95 * behind.sum()
+    T = se3.inverse(poses[0]) @ poses[-1]
+    distance, angle = distance_and_angle(T, steps[-1][0].T_component_camera)
+    assert distance < 0.03
+    assert np.degrees(angle) < 0.7
+
+
 def test_stopped_object_becomes_static(room):
     frames, poses, noise = room
     centres, half = trajectory("sideways", 0.15, frames[0])

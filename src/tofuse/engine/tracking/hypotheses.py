@@ -284,7 +284,7 @@ class Hypotheses:
         if not is_due:
             return hypothesis, None
         keyframe, T = hypothesis.keyframe, hypothesis.T_component_camera
-        moving = self._moving(T, keyframe, suspected=suspected)
+        moving = self._moving_wholly(T, keyframe, suspected=suspected)
         excluded = np.count_nonzero(view.planes[..., 3]) - np.count_nonzero(
             hypothesis.view.planes[..., 3]
         )
@@ -292,7 +292,8 @@ class Hypotheses:
             static = self._without_moving(moving, T, keyframe, predicted=hypothesis.predicted)
             if static.fit.is_usual or not hypothesis.fit.is_usual:
                 hypothesis = static
-                moving = self._moving(static.T_component_camera, keyframe, suspected=suspected)
+                T = static.T_component_camera
+                moving = self._moving_wholly(T, keyframe, suspected=suspected)
         objects.update(moving)
         return hypothesis, moving
 
@@ -399,6 +400,24 @@ class Hypotheses:
         return self.state.objects.compare(
             self.view, T, keyframe.view, keyframe.T_component_camera, suspected=suspected
         )
+
+    def _moving_wholly(self, T: Float64, keyframe: Keyframe, *, suspected: bool) -> Moving:
+        """Segment objects by a keyframe; if any move, by the newest one without any as well.
+
+        What comes into view behind the front of an object, as a body behind an arm, is in free
+        space of that one alone.
+        """
+        objects = self.state.objects
+        moving = self._moving(T, keyframe, suspected=suspected)
+        if not moving.reliable or moving.fraction <= MIN_MOVING_FRACTION:
+            return moving
+        still = self.state.keyframes.newest_of(self.state.component, objects.none_in)
+        if still is None or still.view.index == keyframe.view.index:
+            return moving
+        since_then = self._moving(T, still, suspected=suspected)
+        if not since_then.reliable:
+            return moving
+        return objects.with_cells(moving, since_then.pair_update.last.cells.moving)
 
     def _without_moving(
         self, moving: Moving, T: Float64, keyframe: Keyframe, *, predicted: bool

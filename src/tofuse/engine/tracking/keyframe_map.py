@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -73,6 +74,11 @@ class KeyframeMap:
     def newest(self) -> Keyframe:
         """The keyframe that views are tracked against."""
         return self._keyframes[-1]
+
+    def newest_of(self, component: int, accepts: Callable[[PreparedView], bool]) -> Keyframe | None:
+        """Return the newest keyframe of a component with a view that is accepted."""
+        of_component = (k for k in reversed(self._keyframes) if k.component == component)
+        return next((k for k in of_component if accepts(k.view)), None)
 
     def add(self, keyframe: Keyframe) -> None:
         """Add the newest keyframe; beyond the capacity, remove the most redundant one."""

@@ -230,6 +230,11 @@ class MovingObjects:
         """Return the (H, W) pixels of a keyframe whose surface has moved."""
         return _pixels(self._reference(reference).moving, reference.z.shape, stride_of(reference))
 
+    def none_in(self, reference: PreparedView) -> bool:
+        """Whether nothing moves in a keyframe that views were compared with."""
+        cells = self._references.get(reference.index)
+        return cells is not None and not cells.moving.any()
+
     def compare(
         self,
         view: PreparedView,
