@@ -218,8 +218,8 @@ def error_by_range(positions: Float64, shared: float, depth_m: float) -> float:
         return 0.0
     some = positions[evenly_spaced(np.arange(len(positions)), _EVENLY_SPACED)] / depth_m
     distances = np.linalg.norm(some[:, None] - some, axis=2)
-    # Twice the double integral of exp(-|s - t|) over the distance; half of it is the mean square
-    # deviation from the mean position.
+    # Half of the double integral of exp(-|s - t|) over the distance: the mean square difference of
+    # two poses is twice the mean square deviation from their mean.
     squares = distances - 1 + np.exp(-distances)
     return _COMMON * shared * depth_m * float(np.sqrt(squares.mean()))
 
