@@ -313,7 +313,7 @@ class Assessment:
         split = refinement.split_m, refinement.split_rad
         depth_m = float(np.median(self._depths)) if self._depths else 0.0
         positions = refined.graph.poses[:, :3, 3]
-        range_m = pose_accuracy.error_by_range(positions, refinement.shared, depth_m)
+        range_m = pose_accuracy.error_by_range(positions, refinement.shared_rms, depth_m)
         return pose_accuracy.ObservedErrors(
             *moved, excess_m, *calibration, *split, range_m, corrected=bool(corrections)
         )

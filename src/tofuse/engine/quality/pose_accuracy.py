@@ -4,8 +4,9 @@ All evidence is the mean square of an error, and one quantile is taken of the su
 covariance of the poses models noise and the errors that the patches of a view share, of a usual
 camera; halves of the images measure those of this one, but not what both halves share. Added are
 the correction by the refinement, the excess disagreement of views far apart in time, and the
-displacement by errors of the camera that the views indicate. Each of these may be an error of the
-poses or not, and counts in part. The quantile allows for the sum being an estimate itself, see
+displacement by errors of the camera that the views indicate: each may be an error of the poses or
+not, and counts in part. What neither shows, as multipath on a walk through rooms, is added by its
+expected size. The quantile allows for the sum being an estimate itself, see
 `docs/uncertainty.md`.
 """
 
@@ -194,7 +195,7 @@ class ObservedErrors:
         }
 
 
-def error_by_range(positions: Float64, shared: float, depth_m: float) -> float:
+def error_by_range(positions: Float64, shared_rms: float, depth_m: float) -> float:
     """Return the rms error of positions by errors of the range that differ from place to place, m.
 
     Multipath depends on where the camera is. Where its error grows as the camera approaches a
@@ -209,19 +210,19 @@ def error_by_range(positions: Float64, shared: float, depth_m: float) -> float:
     ----------
     positions
         (N, 3) of the poses, m.
-    shared
-        See `Refinement.shared`.
+    shared_rms
+        See `Refinement.shared_rms`.
     depth_m
         Typical depth, m.
     """
-    if not shared or not depth_m:
+    if not shared_rms or not depth_m:
         return 0.0
     some = positions[evenly_spaced(np.arange(len(positions)), _EVENLY_SPACED)] / depth_m
     distances = np.linalg.norm(some[:, None] - some, axis=2)
     # Half of the double integral of exp(-|s - t|) over the distance: the mean square difference of
     # two poses is twice the mean square deviation from their mean.
     squares = distances - 1 + np.exp(-distances)
-    return _COMMON * shared * depth_m * float(np.sqrt(squares.mean()))
+    return _COMMON * shared_rms * depth_m * float(np.sqrt(squares.mean()))
 
 
 @dataclass(frozen=True, eq=False)

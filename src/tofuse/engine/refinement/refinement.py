@@ -57,7 +57,7 @@ _ERROR_INDEX: dict[CameraError, int] = {
 
 
 # Errors of the camera, and (m, rad) of the poses by halves of the images.
-# The check of the camera; errors by halves of the images (m, rad), and `Refinement.shared`.
+# The check of the camera; errors by halves of the images (m, rad), and `Refinement.shared_rms`.
 _Evaluation = tuple[CalibrationCheck, tuple[float, float, float]]
 _Views = Sequence[PosedView[PreparedView]]
 
@@ -89,7 +89,7 @@ class Refinement:
         Pairs (i, j) of edges that do not come from the overlap of the two views.
     split_m, split_rad
         Rms errors of the poses by halves of the images (`split_half`); 0 unless kept.
-    shared
+    shared_rms
         Rms depth error that patches of the images share, as far as it differs between them:
         relative to the depth, for a change of the viewpoint of 1 rad (`shared_error`); 0 unless
         kept.
@@ -110,7 +110,7 @@ class Refinement:
     non_overlap_edges: tuple[tuple[int, int], ...] = ()
     split_m: float = 0.0
     split_rad: float = 0.0
-    shared: float = 0.0
+    shared_rms: float = 0.0
     pattern: fixed_pattern.FixedPattern = fixed_pattern.NONE
 
     @property
@@ -270,13 +270,13 @@ class _Joint(Refiner):
         if support_fell(gain):  # the camera may be the cause
             return replace(unchanged, calibration_check=calibration)
         after = with_unsupported_views_fixed(before, refined.poses, gain < -MAX_LOSS)
-        split_m, split_rad, shared = _mean_errors([errors for _, errors in evaluated])
+        split_m, split_rad, shared_rms = _mean_errors([errors for _, errors in evaluated])
         return replace(
             unchanged.accepted(positions, after),
             calibration_check=calibration,
             split_m=split_m,
             split_rad=split_rad,
-            shared=shared,
+            shared_rms=shared_rms,
             errors={name: float(refined.errors[_ERROR_INDEX[name]]) for name in options.calibrate},
             edges=pairwise_measurements([p.index for p in posed], refined),
             pattern=pattern,
