@@ -205,6 +205,30 @@ def test_what_comes_in_behind_the_front_of_an_object_moves_too(room):
     assert np.degrees(angle) < 0.7
 
 
+def varying_all_over(frame, percent):
+    """Return a frame of which a tenth, in small squares all over the image, is farther."""
+    rows, columns = (np.arange(n) // 8 for n in frame.valid.shape)
+    squares = np.random.default_rng(5).random((rows[-1] + 1, columns[-1] + 1)) < 0.1
+    farther = np.where(squares[np.ix_(rows, columns)], 1 + percent / 100, 1)
+    return replace(frame, depth=frame.depth * farther.astype(np.float32))
+
+
+def test_objects_explain_disagreement_unless_it_is_all_over_the_image(room):
+    frames, poses, noise = room
+    still = prepare_view(frames[0], SurfaceOptions())
+    varied = prepare_view(varying_all_over(frames[0], 10), SurfaceOptions())
+    box = np.array([0.1, 0, 0.9]), np.array([0.08, 0.15, 0.05])
+    view = prepare_view(with_box(frames[1], *box, noise, 1)[0], SurfaceOptions())
+
+    def found(reference, T):
+        return MovingObjects().compare(view, T, reference, poses[0], suspected=True)
+
+    wrong = poses[1] @ se3.exp([0.03, 0, 0, 0, 0.05, 0])
+    results = found(still, poses[1]), found(varied, poses[1]), found(still, wrong)
+    assert all(moving.reliable and moving.fraction > 0.05 for moving in results)
+    assert [moving.explains_disagreement for moving in results] == [True, False, False]
+
+
 def test_stopped_object_becomes_static(room):
     frames, poses, noise = room
     centres, half = trajectory("sideways", 0.15, frames[0])

@@ -415,7 +415,7 @@ class Hypotheses:
         if still is None or still.view.index == keyframe.view.index:
             return moving
         since_then = self._moving(T, still, suspected=suspected)
-        if not since_then.reliable:
+        if not since_then.explains_disagreement:
             return moving
         return objects.with_cells(moving, since_then.pair_update.last.cells.moving)
 

@@ -42,6 +42,8 @@ _MIN_CORE, _MIN_SIZE = 0.25, 0.004
 # Minimum fraction of the comparisons outside of the mask that agree, for a pair of views to be
 # evidence of motion. Below, a wrong pose is as likely.
 _MIN_AGREEMENT = 0.5
+# Disagreement outside of the objects, as a fraction of their size, up to which they explain it.
+_SCATTERED = 0.1
 # Moving fraction of a view above which the static rest is realigned, and the mask reported.
 MIN_MOVING_FRACTION = 0.01
 # Number of reference views whose log-odds are kept.
@@ -116,6 +118,14 @@ class Moving:
     scale: float
     reliable: bool
     pair_update: PairUpdate
+
+    @property
+    def explains_disagreement(self) -> bool:
+        """Whether the views disagree where objects are, and hardly elsewhere.
+
+        Smoothed depth, and a pose that is wrong, disagree all over the image.
+        """
+        return self.reliable and 1 - self.agreement <= _SCATTERED * self.fraction
 
     def applied(self, view: PreparedView) -> PreparedView:
         """Return the view without its pixels that moved."""
