@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tofuse.apps.mirrors.finding import _behind
 from tofuse.apps.mirrors.openings import Opening, Plane
 from tofuse.apps.mirrors.reflection import Evidence, _shortened, predict, weigh
-from tofuse.apps.mirrors.views import Noise, View, wrapped
+from tofuse.apps.mirrors.views import Noise, View, with_too_short, wrapped
 from tofuse.engine.cameras import Pinhole
 from tofuse.engine.geometry import se3
 
@@ -84,7 +86,15 @@ def _before_the_mirror(ranges: np.ndarray | float) -> View:
     T = se3.exp(np.array([0, 0, 0, np.pi, 0, 0]))
     T[2, 3] = 1.5
     camera = Pinhole(60, 60, 70.0, 70.0, 29.5, 29.5)
-    return View(camera, T, np.broadcast_to(ranges, (60, 60)).copy(), None, 0.6, np.inf)
+    return View(
+        camera,
+        T,
+        np.broadcast_to(ranges, (60, 60)).copy(),
+        None,
+        0.6,
+        np.inf,
+        np.zeros((60, 60), bool),
+    )
 
 
 def _shown(share_on_plane: float) -> Evidence:
@@ -147,7 +157,8 @@ def _view_from_behind(range_m: float) -> View:
     T = np.eye(4)
     T[2, 3] = -2.0
     camera = Pinhole(40, 30, 35.0, 35.0, 19.5, 14.5)
-    return View(camera, T, np.full((30, 40), range_m), None, 0.6, np.inf)
+    none = np.zeros((30, 40), bool)
+    return View(camera, T, np.full((30, 40), range_m), None, 0.6, np.inf, none)
 
 
 @pytest.mark.parametrize(("range_m", "is_room"), [(1.0, True), (1.9, False)])
@@ -167,9 +178,35 @@ def test_an_opening_is_seen_in_front_of_its_plane_only() -> None:
     assert not _OPENING.seen_by(behind, 0.0)
     turned = se3.exp(np.array([0, 0, 0, np.pi, 0, 0]))
     turned[2, 3] = 2.0
-    front = View(behind.camera, turned, behind.ranges, None, 0.6, np.inf)
+    front = replace(behind, T_world_camera=turned)
     assert _OPENING.seen_by(front, 0.0)
     turned = turned.copy()
     turned[0, 3] = 5.0
-    aside = View(behind.camera, turned, behind.ranges, None, 0.6, np.inf)
+    aside = replace(behind, T_world_camera=turned)
     assert not _OPENING.seen_by(aside, 0.0)
+
+
+def test_ranges_are_too_short_where_other_views_see_through() -> None:
+    """A box at 1.5 m is there for every view; a range of 6.5 m, wrapped at 5, moves with each."""
+    camera = Pinhole(40, 30, 35.0, 35.0, 19.5, 14.5)
+    rays = np.concatenate([camera.rays(), np.ones((30, 40, 1))], -1)
+    lengths = np.linalg.norm(rays, axis=-1)
+    views, wraps, boxes = [], [], []
+    for x in np.linspace(-0.5, 0.5, 9):
+        T = np.eye(4)
+        T[0, 3] = x
+        at_wall = 4 * rays[..., 0] + x
+        beyond = (at_wall > 0.3) & (at_wall < 1.2)
+        box = np.abs(1.5 * rays[..., 0] + x + 0.6) < 0.15
+        z = np.where(box, 1.5, np.where(beyond, 6.5, 4.0))
+        ranges = np.where(beyond & ~box, (z * lengths) % 5.0, z * lengths)
+        ranges[beyond & ~box & (z * lengths < 5.0)] = 0
+        views.append(View(camera, T, ranges, None, 0.6, 5.0, np.zeros((30, 40), bool)))
+        wraps.append(beyond & ~box)
+        boxes.append(box)
+    found = [view.too_short for view in with_too_short(views, 0.1)]
+    assert np.concatenate(found)[np.concatenate(wraps)].mean() > 0.8
+    assert np.concatenate(found)[np.concatenate(boxes)].mean() < 0.1
+    assert not np.concatenate(found)[~np.concatenate(wraps) & ~np.concatenate(boxes)].any()
+    endless = [replace(view, ambiguity_m=np.inf) for view in views]
+    assert not any(view.too_short.any() for view in with_too_short(endless, 0.1))

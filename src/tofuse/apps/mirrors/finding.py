@@ -9,14 +9,15 @@ import numpy as np
 
 from tofuse.apps.mirrors.openings import Opening, find_openings, find_planes
 from tofuse.apps.mirrors.reflection import Evidence, weigh
-from tofuse.apps.mirrors.views import Noise, View, views_of
+from tofuse.apps.mirrors.views import Noise, View, views_of, with_too_short
 from tofuse.engine.arrays import Bool, Float32, Float64
 from tofuse.engine.frames import Recording, evenly_spaced
 from tofuse.engine.fusion import Cloud
 from tofuse.engine.results import Mirror, Reconstruction
 
-# A mirror is this much likelier than chance (logarithm), and agrees in this share of its pixels.
-_MIN_LOG_RATIO, _MIN_SHARE = 7.0, 0.3
+# A mirror is this much likelier than chance (logarithm), or so much where it is not surrounded by
+# surface, as most such openings are none; and it agrees in this share of its pixels.
+_MIN_LOG_RATIO, _MIN_LOG_RATIO_FRAYED, _MIN_SHARE = 7.0, 20.0, 0.3
 # Points that predict, views of a first look, and the smallest share there for a second one.
 _POINTS, _FIRST_LOOK, _PROMISING = 30_000, 10, 0.2
 # Planes of several surfaces are none: half of the tilt at which a mirror is a wrong one.
@@ -43,6 +44,7 @@ def find_mirrors(recording: Recording, result: Reconstruction, seed: int = 0) ->
         return result
     points, normals = cloud.points.astype(np.float64), cloud.normals.astype(np.float64)
     noise = Noise.of(views, points)
+    views = with_too_short(views, 2 * noise.tolerance_m)
     rng = np.random.default_rng([seed, 17])
     planes = find_planes(points, normals, noise.tolerance_m, rng)
     chosen = rng.permutation(len(points))[:_POINTS]
@@ -70,7 +72,7 @@ def _weighed(
     views = [view for view in views if opening.seen_by(view, 2 * noise.tolerance_m)]
     step = max(1, len(views) // _FIRST_LOOK)
     first = weigh(opening, views[::step], points, normals, noise, compare=False)
-    if not opening.whole or (step > 1 and first.patches and first.share < _PROMISING):
+    if step > 1 and first.patches and first.share < _PROMISING:
         return first
     return weigh(opening, views, points, normals, noise)
 
@@ -87,7 +89,8 @@ def _mirrors_in(weighed: Sequence[tuple[Opening, Evidence]]) -> list[_Found]:
                 accepted[k] = joined, known
                 break
         else:
-            if opening.whole and evidence.log_ratio > _MIN_LOG_RATIO:
+            needed = _MIN_LOG_RATIO if opening.whole else _MIN_LOG_RATIO_FRAYED
+            if evidence.log_ratio > needed:
                 accepted.append((opening, evidence))
     return accepted
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from tofuse.apps.mirrors.views import Noise, View
+from tofuse.apps.mirrors.views import RAYS, Noise, View
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.geometry import tangents, unit_rays
 
@@ -16,8 +16,7 @@ from tofuse.engine.geometry import tangents, unit_rays
 # smallest cosine between its normal and those of its points.
 _HYPOTHESES, _VOTERS, _MIN_SHARE, _MIN_COSINE = 300, 6000, 0.01, 0.9
 _MAX_PLANES = 16
-# Rays of a view that are tested, and the smallest cosine between a ray and the plane's normal.
-_RAYS, _MIN_INCIDENCE = 6000, 0.08
+_MIN_INCIDENCE = 0.08  # smallest cosine between a ray and the plane's normal
 # An opening: minimum number of cells, of rays in a cell, share of an opening's convex hull that it
 # fills, and share of its border where the plane is a surface; the last two also for a whole one,
 # whose outline noise may fray, but whose border is closed.
@@ -176,14 +175,14 @@ def find_openings(plane: Plane, views: Sequence[View], noise: Noise) -> list[Ope
     for view in views:
         if plane.height(view.origin) < 2 * margin:
             continue
-        step = max(1, int(np.sqrt(view.ranges.size / _RAYS)))
+        step = view.step
         measured = view.ranges[::step, ::step].ravel()
         rays = unit_rays(view.camera.rays()[::step, ::step].reshape(-1, 2))
         rays = rays @ view.T_world_camera[:3, :3].T
         reached = plane.crossings(view.origin, rays)
         depth = (measured - reached) * np.abs(rays @ plane.normal)
         # Where nothing returns, the plane is no surface either.
-        depth[measured <= 0] = np.inf
+        depth[(measured <= 0) | view.too_short.ravel()] = np.inf
         used = np.isfinite(reached) & (depth > -margin)
         q = view.origin + reached[used, None] * rays[used]
         places.append(q @ plane.axes.T)
@@ -197,7 +196,7 @@ def find_openings(plane: Plane, views: Sequence[View], noise: Noise) -> list[Ope
         return []
     # What is far beyond the surface in the plane is not an opening in it.
     low, high = np.quantile(ends, 0.005, axis=0) - 0.1, np.quantile(ends, 0.995, axis=0) + 0.1
-    field = np.tan(views[0].corner_rad) * 2 / np.sqrt(2 * min(_RAYS, views[0].ranges.size))
+    field = np.tan(views[0].corner_rad) * 2 / np.sqrt(2 * min(RAYS, views[0].ranges.size))
     cell = float(max(field * np.nanmedian(pitches), (high - low).max() / 1000))
     shape = np.ceil((high - low) / cell).astype(int)
     return _regions(plane, flat, through, low, cell, shape)
@@ -245,5 +244,7 @@ def _regions(
         if convexity < _MIN_CONVEXITY or framed < _MIN_FRAME:
             continue
         whole = convexity > _WHOLE_CONVEXITY and framed > _WHOLE_FRAME
-        openings.append(Opening(plane, low + cell * hull, whole))
+        # Pixels that look partly into a mirror measure beyond its frame: by half of one, a cell.
+        inner = _hull(np.stack([rows, columns], 1).astype(np.float64) + 0.5)
+        openings.append(Opening(plane, low + cell * inner, whole))
     return openings

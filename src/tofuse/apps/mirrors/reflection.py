@@ -19,8 +19,9 @@ from tofuse.engine.arrays import Bool, Float64, Int64
 from tofuse.engine.frames import evenly_spaced
 
 _REFLECTANCE = 0.9  # of a mirror; the result hardly depends on it
-# Share of light that the shorter path may have more or less than predicted.
-_DIVISION = 0.1
+# Share of light that the shorter path may have more or less than predicted. The more it may, the
+# more of the ranges agree with wrong planes, too.
+_DIVISION = 0.03
 # Wavelengths of the modulation that are tried, on so many pixels.
 _PERIODS_M, _LIT = (0.0, np.inf, *np.geomspace(0.7, 6.0, 38)), 1500
 # Beyond this multiple of the corner's angle, lamps don't shine.

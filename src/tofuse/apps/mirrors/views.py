@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,11 +11,13 @@ from tofuse.engine.arrays import Bool, Float32, Float64, Int64
 from tofuse.engine.cameras import Camera
 from tofuse.engine.errors import UnreadableFrameError
 from tofuse.engine.frames import RangeFrame, Recording, evenly_spaced
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, unit_rays
 from tofuse.engine.results import Reconstruction
 from tofuse.engine.sensor import CameraErrors
 
 _VIEWS = 60
+# Rays of a view that are tested, and views that tell which of their ranges are too short.
+RAYS, _WITNESSES = 6000, 20
 # A cell of the depth buffer, in pixels, and how far behind the nearest point of its cell another
 # one may be, as a fraction of its range, to be visible as well.
 _CELL, _VISIBLE = 3, 0.03
@@ -37,6 +39,9 @@ class View:
         Angle between the axis and the corner of the image.
     ambiguity_m
         Ranges are known up to multiples of it.
+    too_short
+        Which of every `step`-th pixel, by row and column, measure a range that is too short by such
+        a multiple; see `with_too_short`.
     """
 
     camera: Camera
@@ -45,6 +50,12 @@ class View:
     amplitude: Float32 | None
     corner_rad: float
     ambiguity_m: float
+    too_short: Bool
+
+    @property
+    def step(self) -> int:
+        """Of the rows and columns of pixels of which each is looked at."""
+        return step_of(self.ranges.shape)
 
     @property
     def origin(self) -> Float64:
@@ -84,6 +95,11 @@ def wrapped(difference: Float64, ambiguity_m: Float64 | float) -> Float64:
     return difference - periods * np.where(np.isfinite(ambiguity_m), ambiguity_m, 0.0)
 
 
+def step_of(shape: tuple[int, ...]) -> int:
+    """Return the step of rows and columns that leaves about `RAYS` pixels of an image."""
+    return max(1, int(np.sqrt(np.prod(shape) / RAYS)))
+
+
 def views_of(recording: Recording, result: Reconstruction) -> list[View]:
     """Read evenly spaced frames that have a pose."""
     correctors = CameraErrors.made_with(result.config)
@@ -98,6 +114,7 @@ def views_of(recording: Recording, result: Reconstruction) -> list[View]:
         if not isinstance(frame, RangeFrame) or not frame.valid.any():
             continue
         rays = frame.camera.rays()
+        step = step_of(frame.valid.shape)
         views.append(
             View(
                 frame.camera,
@@ -106,9 +123,44 @@ def views_of(recording: Recording, result: Reconstruction) -> list[View]:
                 frame.amplitude_image,
                 float(np.arctan(np.nanmax(np.linalg.norm(rays, axis=-1)))),
                 frame.ambiguity_m or np.inf,
+                np.zeros(frame.valid[::step, ::step].shape, np.bool_),
             )
         )
     return views
+
+
+def with_too_short(views: Sequence[View], margin: float) -> list[View]:
+    """Find the ranges that are too short by a multiple of the ambiguity range.
+
+    They end where most other views that look there measure more than `margin` m farther.
+    """
+    witnesses = [views[k] for k in evenly_spaced(np.arange(len(views)), _WITNESSES)]
+    return [
+        replace(view, too_short=_too_short(view, witnesses, margin))
+        if np.isfinite(view.ambiguity_m)
+        else view
+        for view in views
+    ]
+
+
+def _too_short(view: View, witnesses: Sequence[View], margin: float) -> Bool:
+    ranges = view.ranges[:: view.step, :: view.step]
+    valid = ranges > 0
+    rays = view.camera.rays()[:: view.step, :: view.step]
+    points = unit_rays(rays[valid]) * ranges[valid][:, None]
+    points = se3.transform(view.T_world_camera, points)
+    votes = np.zeros(len(points), np.int64)
+    for other in witnesses:
+        if other is view:
+            continue
+        in_camera, pixels, inside = other.project(points)
+        measured = other.at(other.ranges, pixels)
+        beyond = measured - np.linalg.norm(in_camera, axis=1)
+        looked = inside & (measured > 0) & (beyond > -margin)
+        votes += np.where(looked, np.where(beyond > margin, 1, -1), 0)
+    out = np.zeros(ranges.shape, np.bool_)
+    out[valid] = votes > 0
+    return out
 
 
 @dataclass(frozen=True)
