@@ -131,6 +131,13 @@ def test_what_stands_before_a_mirror_hides_its_image() -> None:
     assert 0 < count(*with_box) < 0.8 * alone
 
 
+def test_of_a_surface_whose_back_is_in_the_model_nothing_is_predicted() -> None:
+    points, normals = _room()
+    view = _before_the_mirror(3.0)
+    assert len(predict(_OPENING, _OPENING.plane, [view], points, normals, _NOISE)) > 100
+    assert not len(predict(_OPENING, _OPENING.plane, [view], points, -normals, _NOISE))
+
+
 @pytest.mark.parametrize("is_mirror", [True, False])
 @pytest.mark.parametrize("far_wall", [True, False])
 def test_a_room_like_the_reflection_has_no_second_path(is_mirror: bool, far_wall: bool) -> None:

@@ -197,10 +197,11 @@ def _of_view(
     angle = np.arccos(np.clip(in_camera[:, 2] / np.maximum(distance, 1e-9), -1, 1))
     seen = view.at(view.ranges, at)
     lit = inside & ((seen <= 0) | (seen > distance - 2 * noise.tolerance_m))
-    # Outside of the image, whether it is lit is not known.
-    known = inside | (angle > _LAMP * view.corner_rad)
     reflected = rays - 2 * (rays @ mirror.normal)[:, None] * mirror.normal
-    by_mirror = _REFLECTANCE * np.maximum(-(n * reflected).sum(1), 0) / length**2
+    facing = -(n * reflected).sum(1)
+    # Outside of the image, whether it is lit is not known; nor the front of what shows its back.
+    known = (inside | (angle > _LAMP * view.corner_rad)) & (facing > 0)
+    by_mirror = _REFLECTANCE * np.maximum(facing, 0) / length**2
     toward = (p - origin) / np.maximum(distance, 1e-9)[:, None]
     direct = lit * np.maximum(-(n * toward).sum(1), 0) / np.maximum(distance, 1e-9) ** 2
     share = direct / np.maximum(direct + by_mirror, 1e-12)
