@@ -161,10 +161,9 @@ def _behind(
     for view in views:
         if opening.plane.height(view.origin) > -margin or not len(rows):
             continue
-        in_camera, pixels, inside = view.project(points[rows].astype(np.float64))
-        beyond = view.at(view.ranges, pixels) - np.linalg.norm(in_camera, axis=1)
-        looked |= inside & (beyond > -margin)
-        measured |= inside & (np.abs(beyond) < margin)
+        beyond = view.beyond(points[rows].astype(np.float64))
+        looked |= beyond > -margin
+        measured |= np.abs(beyond) < margin
     out = through.copy()
     out[rows] = ~measured
     return out, bool(measured.sum() > 0.5 * looked.sum())

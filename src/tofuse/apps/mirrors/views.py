@@ -54,7 +54,7 @@ class View:
 
     @property
     def step(self) -> int:
-        """Of the rows and columns of pixels of which each is looked at."""
+        """Step of the rows and columns of the pixels whose rays are tested."""
         return step_of(self.ranges.shape)
 
     @property
@@ -83,6 +83,13 @@ class View:
         np.minimum.at(nearest, key, distance)
         front = distance < (1 + _VISIBLE) * nearest[key]
         return rows[front], pixels[rows[front]]
+
+    def beyond(self, points: Float64) -> Float64:
+        """How much farther than points (N, 3) the view measures, m; -inf where it does not."""
+        in_camera, pixels, inside = self.project(points)
+        measured = self.at(self.ranges, pixels)
+        known = inside & (measured > 0)
+        return np.where(known, measured - np.linalg.norm(in_camera, axis=1), -np.inf)
 
     def at(self, image: Float64 | Float32, pixels: Int64) -> Float64:
         """Values (N,) of an image (H, W) at pixels (N, 2)."""
@@ -132,7 +139,7 @@ def views_of(recording: Recording, result: Reconstruction) -> list[View]:
 def with_too_short(views: Sequence[View], margin: float) -> list[View]:
     """Find the ranges that are too short by a multiple of the ambiguity range.
 
-    They end where most other views that look there measure more than `margin` m farther.
+    Most other views that look at their ends measure more than `margin` m farther.
     """
     witnesses = [views[k] for k in evenly_spaced(np.arange(len(views)), _WITNESSES)]
     return [
@@ -153,11 +160,8 @@ def _too_short(view: View, witnesses: Sequence[View], margin: float) -> Bool:
     for other in witnesses:
         if other is view:
             continue
-        in_camera, pixels, inside = other.project(points)
-        measured = other.at(other.ranges, pixels)
-        beyond = measured - np.linalg.norm(in_camera, axis=1)
-        looked = inside & (measured > 0) & (beyond > -margin)
-        votes += np.where(looked, np.where(beyond > margin, 1, -1), 0)
+        beyond = other.beyond(points)
+        votes += np.where(beyond > -margin, np.where(beyond > margin, 1, -1), 0)
     out = np.zeros(ranges.shape, np.bool_)
     out[valid] = votes > 0
     return out
