@@ -278,11 +278,7 @@ def test_log_output_is_concise_and_notes_appear_once(recording, tmp_path, capfd)
 @pytest.mark.nightly_part
 @pytest.mark.parametrize(
     ("stage", "error"),
-    [
-        ("tracking", KeyboardInterrupt),
-        ("checking", TofuseError),
-        ("writing", RuntimeError),
-    ],
+    [("tracking", KeyboardInterrupt), ("checking", TofuseError), ("writing", RuntimeError)],
 )
 def test_interrupted_run_changes_nothing(
     stage, error, quick_run, room_recording, tmp_path, monkeypatch

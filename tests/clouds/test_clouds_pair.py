@@ -7,15 +7,7 @@ import pytest
 
 import tofuse
 from pose_errors import assert_near
-from registration_scenes import (
-    box_walls,
-    error,
-    relief,
-    rng,
-    stone,
-    turn,
-    view,
-)
+from registration_scenes import box_walls, error, relief, rng, stone, turn, view
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp.coarse_to_fine import CoarseToFine, averaged

@@ -99,10 +99,7 @@ def test_rays_of_each_frame(tmp_path: Path) -> None:
     after = open_recording(tmp_path / "out")
     check_same(before, after, depth=0.51e-4)
     assert isinstance(after[1].camera, RayTable)
-    assert not np.array_equal(
-        after[0].camera.rays(),
-        after[1].camera.rays(),
-    )
+    assert not np.array_equal(after[0].camera.rays(), after[1].camera.rays())
     (tmp_path / "out" / "rays" / "000001.npy").unlink()
     with pytest.raises(InputError, match="rays: has 2 images"):
         open_recording(tmp_path / "out")

@@ -126,9 +126,7 @@ def test_compensated_amplitude_is_not_compensated_again(thinned) -> None:
     square = (frame.point_image.astype(float) ** 2).sum(-1)
     raw = replace(frame, amplitude_image=(1000 * albedo / square).astype(np.float32))
     compensated = replace(
-        frame,
-        amplitude_image=albedo.astype(np.float32),
-        amplitude_kind="range_compensated",
+        frame, amplitude_image=albedo.astype(np.float32), amplitude_kind="range_compensated"
     )
     found = [fuse([as_cloud(f, 10**6) if thinned else f]) for f in (raw, compensated)]
     assert np.ptp(found[0].color) == 255

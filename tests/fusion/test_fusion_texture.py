@@ -113,8 +113,7 @@ def test_atlas_holds_every_triangle_once(plain: bool, monkeypatch) -> None:
         pytest.importorskip("xatlas")
     atlas = unwrap(mesh, 256)
     np.testing.assert_array_equal(
-        np.sort(np.sort(atlas.vertices[atlas.faces], 1), 0),
-        np.sort(np.sort(mesh.faces, 1), 0),
+        np.sort(np.sort(atlas.vertices[atlas.faces], 1), 0), np.sort(np.sort(mesh.faces, 1), 0)
     )
     # With the same winding, so that the outside stays outside.
     np.testing.assert_array_equal(

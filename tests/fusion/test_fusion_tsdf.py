@@ -12,10 +12,7 @@ from ball_views import CAMERA, EYE, around_a_ball, frame_of, look, plane_range, 
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.spill import Spill
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.engine.fusion.block_kernels import (
-    block_of,
-    voxel_of,
-)
+from tofuse.engine.fusion.block_kernels import block_of, voxel_of
 from tofuse.engine.fusion.model import ModelBuilder
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.fusion.range_view import DECODED, CameraCorrection, RangeView

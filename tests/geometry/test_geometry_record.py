@@ -21,16 +21,7 @@ FACE = np.array([[0, 1, 2]], np.int32)
 
 
 @pytest.mark.parametrize(
-    "write",
-    [
-        write_e57,
-        write_glb,
-        write_gltf,
-        write_las,
-        write_obj,
-        write_pcd,
-        write_ply,
-    ],
+    "write", [write_e57, write_glb, write_gltf, write_las, write_obj, write_pcd, write_ply]
 )
 def test_every_writer_checks_shapes(tmp_path, write) -> None:
     for record, words in (

@@ -6,11 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from made_recordings import (
-    CAMERA,
-    pcd_bytes,
-    pcd_points,
-)
+from made_recordings import CAMERA, pcd_bytes, pcd_points
 from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord

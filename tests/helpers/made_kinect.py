@@ -68,10 +68,7 @@ def calibration(model: str = "BrownConrady", radius: float = 1.74) -> dict[str, 
             "Rt": {"Rotation": np.eye(3).ravel().tolist(), "Translation": t},
         }
 
-    cameras = [
-        camera("D0", DEPTH_LENS, [0, 0, 0], radius),
-        camera("PV0", COLOR_LENS, BASELINE, 0),
-    ]
+    cameras = [camera("D0", DEPTH_LENS, [0, 0, 0], radius), camera("PV0", COLOR_LENS, BASELINE, 0)]
     return {"CalibrationInformation": {"Cameras": cameras}}
 
 

@@ -305,11 +305,7 @@ def jpeg_bytes(image: np.ndarray) -> bytes:
 
 
 def orbbec(
-    folder: Path,
-    distortion: tuple[float, ...],
-    *,
-    color: str = "",
-    R: np.ndarray | None = None,
+    folder: Path, distortion: tuple[float, ...], *, color: str = "", R: np.ndarray | None = None
 ) -> Path:
     """A bag as Orbbec's SDK writes it: ROS images with fields appended, and profiles of its own."""
     bag = Bag(folder, "ros1")

@@ -10,17 +10,8 @@ from hypothesis import strategies as st
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
-from tofuse.engine.icp.icp_kernels import (
-    shortest_of_each_target,
-    transform_points,
-)
-from tofuse.engine.icp.icp_parts import (
-    ClosestPoint,
-    MaxDistance,
-    PointToPoint,
-    Random,
-    TwoLoops,
-)
+from tofuse.engine.icp.icp_kernels import shortest_of_each_target, transform_points
+from tofuse.engine.icp.icp_parts import ClosestPoint, MaxDistance, PointToPoint, Random, TwoLoops
 from tofuse.engine.icp.interfaces import Alignment, History, Matches, Points
 
 seeds = st.integers(0, 2**32 - 1)

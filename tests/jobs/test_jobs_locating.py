@@ -28,10 +28,7 @@ from tofuse.formats.poses.trajectory import read_tum
 AGAIN = [at(0.1 + 0.02 * k, 0.1, 0.05 + 0.1 * k, 0.25, -0.05) for k in range(6)]
 T_WORLD_ROOM = se3.inverse(HERE[0])
 # The same walls with other furniture, and another room altogether.
-FOREIGN = (
-    {"boxes": OTHER, "scene": 8},
-    {"boxes": OTHER, "scene": 9, "half": (1.6, 1.3, 2.4)},
-)
+FOREIGN = ({"boxes": OTHER, "scene": 8}, {"boxes": OTHER, "scene": 9, "half": (1.6, 1.3, 2.4)})
 
 
 def again(folder: Path, poses=AGAIN, **scene) -> Path:

@@ -11,11 +11,7 @@ from registration_scenes import bumpy_ball, error, relief, rng, turn, view
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp.icp import Icp
 from tofuse.engine.icp.icp_parts import All, Random, SmallStep
-from tofuse.lab.methods.variants import (
-    Iccp,
-    Icpif,
-    Tricp,
-)
+from tofuse.lab.methods.variants import Iccp, Icpif, Tricp
 
 
 def vanilla(resolution, points, steps=100):

@@ -200,9 +200,7 @@ def test_correct_focal_length_is_unchanged(recording) -> None:
 def assessed(result, error: float | None, bound: float, posed: int = 3):
     """A result whose views reveal an error of the focal length."""
     found = CalibrationCheck(
-        error is not None,
-        {"focal": error or 0.0},
-        estimates={"focal": (error or 0.0, 0.001)},
+        error is not None, {"focal": error or 0.0}, estimates={"focal": (error or 0.0, 0.001)}
     )
     poses = np.tile(np.eye(4), (3, 1, 1))
     refinement = Refinement(poses, True, 3, 3, support=(0.5, 0.9), calibration_check=found)

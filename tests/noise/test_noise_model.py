@@ -15,13 +15,7 @@ from tofuse.engine.cameras.cameras import Pinhole, ray_lengths
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.geometry.rays import homogeneous
-from tofuse.engine.noise.model import (
-    NOISE,
-    AmplitudeLaw,
-    ConfidenceLaw,
-    NoiseModel,
-    RangeLaw,
-)
+from tofuse.engine.noise.model import NOISE, AmplitudeLaw, ConfidenceLaw, NoiseModel, RangeLaw
 from tofuse.formats.cameras.calibration_files import read_noise, write_noise
 
 CAMERA = Pinhole(40, 30, 30.0, 30.0, 19.5, 14.5)

@@ -8,11 +8,7 @@ import pytest
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry.se3 import exp
 from tofuse.engine.times import MAX_GAP_S, associate, nearest, partners
-from tofuse.formats.poses.trajectory import (
-    read_tum,
-    tum_text,
-    write_tum,
-)
+from tofuse.formats.poses.trajectory import read_tum, tum_text, write_tum
 
 
 def _poses(n: int = 20) -> np.ndarray:

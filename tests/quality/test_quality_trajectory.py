@@ -13,11 +13,7 @@ from hypothesis import strategies as st
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.trajectory_errors import (
-    align,
-    evaluate_trajectory,
-    relative_error,
-)
+from tofuse.engine.quality.trajectory_errors import align, evaluate_trajectory, relative_error
 
 
 def walk(n: int, seed: int = 0, spread: float = 1.0) -> Float64:

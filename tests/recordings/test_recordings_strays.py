@@ -94,8 +94,7 @@ def test_camera_names_are_no_paths(name, tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "value"),
-    [("frame_rate_hz", 1e-300), ("frame_rate_hz", 1e300), ("ambiguity_m", 1e-9)],
+    ("field", "value"), [("frame_rate_hz", 1e-300), ("frame_rate_hz", 1e300), ("ambiguity_m", 1e-9)]
 )
 def test_implausible_numbers_are_refused(field, value, recording, tmp_path, capfd) -> None:
     path = recording / "camera.json"

@@ -14,11 +14,7 @@ from corner_views import CAMERA, corner
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.refinement import calibration_check
-from tofuse.engine.refinement.calibration_check import (
-    USUAL,
-    CalibrationCheck,
-    check_calibration,
-)
+from tofuse.engine.refinement.calibration_check import USUAL, CalibrationCheck, check_calibration
 from tofuse.engine.refinement.camera_response import Linearised, SharedErrors, significance_of
 from tofuse.engine.refinement.joint_alignment import (
     Priors,

@@ -13,9 +13,7 @@ from tofuse.engine.compute.spill import Scratch
 from tofuse.engine.refinement.calibration_check import CalibrationCheck, combine_checks
 from tofuse.engine.refinement.refinement import Joint
 from tofuse.engine.refinement.submaps import partition, submaps
-from tofuse.engine.stored_views.view_store import (
-    candidate_pairs,
-)
+from tofuse.engine.stored_views.view_store import candidate_pairs
 from tofuse.engine.views.view_descriptors import (
     mutual_dissimilarity,
     pairwise_dissimilarity,
@@ -130,10 +128,7 @@ def test_descriptor_index_finds_most_similar_views() -> None:
 
 
 def test_submaps_share_camera_errors() -> None:
-    quiet, alarm = (
-        CalibrationCheck(),
-        CalibrationCheck(alarm=True, errors={"focal": 0.05}),
-    )
+    quiet, alarm = (CalibrationCheck(), CalibrationCheck(alarm=True, errors={"focal": 0.05}))
     other = CalibrationCheck(alarm=True, errors={"focal": 0.04})
     assert not combine_checks([]).alarm
     assert not combine_checks([quiet, alarm]).alarm

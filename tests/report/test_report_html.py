@@ -18,10 +18,7 @@ from tofuse.apps.report import plots
 from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.fields import fields
 from tofuse.apps.report.packing import pack
-from tofuse.apps.report.scene import (
-    make_scene,
-    packed,
-)
+from tofuse.apps.report.scene import make_scene, packed
 from tofuse.apps.report.sections import write_report
 from tofuse.apps.report.subject import Subject
 from tofuse.engine.cameras.cameras import Pinhole
@@ -568,10 +565,7 @@ def dark():
 
 
 POOR = {
-    "one cloud": (
-        lonely(),
-        ReportExtras("x", (("raw", cloud_frame()),), clouds=(cloud_frame(),)),
-    ),
+    "one cloud": (lonely(), ReportExtras("x", (("raw", cloud_frame()),), clouds=(cloud_frame(),))),
     "nothing read": (
         lonely(
             trajectory=np.zeros((0, 4, 4)),

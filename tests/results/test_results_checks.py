@@ -176,8 +176,7 @@ CHANGED = Refinement(
     9,
     20,
     calibration_check=CalibrationCheck(
-        motion={"focal": (3.0, 0.2)},
-        range_change=RangeChange(0.05, 0.001, 4, 5.0),
+        motion={"focal": (3.0, 0.2)}, range_change=RangeChange(0.05, 0.001, 4, 5.0)
     ),
 )
 UNDETERMINED = CalibrationCheck(motion={"focal": (3.0, 0.2)})

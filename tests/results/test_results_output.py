@@ -15,12 +15,7 @@ from made_results import contents, result, torn
 from tofuse.apps.export.exporting import export
 from tofuse.apps.jobs.running import exit_status
 from tofuse.apps.results import output
-from tofuse.apps.results.folders import (
-    OutputFolder,
-    check_result,
-    component_number,
-    is_result,
-)
+from tofuse.apps.results.folders import OutputFolder, check_result, component_number, is_result
 from tofuse.apps.results.loading import load_result
 from tofuse.apps.results.output import write_result
 from tofuse.apps.results.run_json import frames_in_main_model, read_run_json
@@ -162,12 +157,7 @@ def test_run_json_matches_contract(tmp_path) -> None:
         "session_pairs changes loops optimiser certificate priors refinement filters sha256"
     )
     assert data["schema"] == 1
-    assert data["input"] == {
-        "path": "/somewhere",
-        "format": "native",
-        "frames": 2,
-        "opening": None,
-    }
+    assert data["input"] == {"path": "/somewhere", "format": "native", "frames": 2, "opening": None}
     assert data["reasons"] == [
         {
             "code": "lost_frames",

@@ -12,12 +12,7 @@ from rig_scene import CAMERA, looked_at
 from tofuse.apps.rigs.calibrating import calibrate_cameras
 from tofuse.apps.rigs.hand_eye import HandEye, Track, hand_eye
 from tofuse.apps.rigs.inputs import Calibration, Camera
-from tofuse.apps.rigs.moving_rig import (
-    _common_world,
-    _initial_offset,
-    _JointViews,
-    _too_uncertain,
-)
+from tofuse.apps.rigs.moving_rig import _common_world, _initial_offset, _JointViews, _too_uncertain
 from tofuse.apps.rigs.rig_trajectory import refined
 from tofuse.apps.rigs.run import reconstruct_rig
 from tofuse.engine.cameras.cameras import Pinhole

@@ -13,10 +13,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.search import search_kernels as kernels
 from tofuse.engine.search.pair_agreement import agreement
 from tofuse.engine.search.plane_detection import find_floor, find_floors
-from tofuse.engine.search.search import (
-    Search,
-    SearchOptions,
-)
+from tofuse.engine.search.search import Search, SearchOptions
 from tofuse.engine.views.extended_planes import with_rough_planes
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
@@ -171,8 +168,7 @@ def test_icp_step_solves_equations_of_both_directions():
         r, w = residuals(*arguments, np.zeros(6))
         step = np.eye(6) * 1e-6
         J = np.stack(
-            [(residuals(*arguments, d)[0] - residuals(*arguments, -d)[0]) / 2e-6 for d in step],
-            1,
+            [(residuals(*arguments, d)[0] - residuals(*arguments, -d)[0]) / 2e-6 for d in step], 1
         )
         H += (J * w[:, None]).T @ J
         g += (J * w[:, None]).T @ r

@@ -131,11 +131,7 @@ def test_depth_and_amplitude_of_any_kind_are_corrected(corner: Seen) -> None:
 
     white = corner.raw * frame.radial_range**2 * corner.length**4
     even = part.start(reflections).apply(
-        replace(
-            frame,
-            amplitude_image=white.astype(np.float32),
-            amplitude_kind="range_compensated",
-        )
+        replace(frame, amplitude_image=white.astype(np.float32), amplitude_kind="range_compensated")
     )
     assert isinstance(even, RangeFrame)
     assert even.amplitude_image is not None

@@ -7,11 +7,7 @@ import pytest
 
 from tofuse.engine.cameras.depth_conversion import range_from_z
 from tofuse.engine.frames.frames import RangeFrame
-from tofuse.engine.sensor.unwrap import (
-    Unwrap,
-    count_periods,
-    on_surface,
-)
+from tofuse.engine.sensor.unwrap import Unwrap, count_periods, on_surface
 from tofuse.engine.sensor.unwrap_kernels import NEIGHBOURS, pass_messages
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan

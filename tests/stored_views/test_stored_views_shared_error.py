@@ -47,12 +47,7 @@ def pair():
 def sums_of(source, target, T):
     residuals = (0.0, WIDE[0], 0.0, 0.0, *WIDE[1:])
     row, sums = pair_equations(
-        source.points,
-        target,
-        T,
-        residuals,
-        patches=source.patches,
-        count=shared_error.PATCHES,
+        source.points, target, T, residuals, patches=source.patches, count=shared_error.PATCHES
     )
     return sums, row
 

@@ -16,11 +16,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.geometry.rigid_motion_kernels import distance_and_angle
 from tofuse.engine.search.pair_agreement import agreement
 from tofuse.engine.tracking.keyframes import Keyframes
-from tofuse.engine.tracking.moving_objects import (
-    Moving,
-    MovingObjects,
-    without_pixels,
-)
+from tofuse.engine.tracking.moving_objects import Moving, MovingObjects, without_pixels
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
 from tofuse.formats.recordings.open import open_recording

@@ -162,11 +162,7 @@ def scene_of(mesh: ScannedMesh) -> Scene:
 
 
 def _planned(
-    scene: Scene,
-    model: CameraModel,
-    poses: Float64,
-    times: Float64 | None,
-    depth_m: float,
+    scene: Scene, model: CameraModel, poses: Float64, times: Float64 | None, depth_m: float
 ) -> RecordingPlan:
     """Plan a recording along poses (N, 4, 4) with as many frames as its motion needs."""
     steps = se3.inverse(poses[:-1]) @ poses[1:]

@@ -26,25 +26,13 @@ from tofuse.apps.jobs import (
     with_findings,
     write_report_files,
 )
-from tofuse.apps.results import (
-    folders,
-    integrity,
-    load_result,
-    reopening,
-    run_json,
-    write_result,
-)
+from tofuse.apps.results import folders, integrity, load_result, reopening, run_json, write_result
 from tofuse.engine import quantities
 from tofuse.engine.errors import InputError, signals_as_themselves
 from tofuse.engine.frames import Frame, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops import PriorLoop
-from tofuse.engine.mapping import (
-    Config,
-    adaptation,
-    configured,
-    reconstructing,
-)
+from tofuse.engine.mapping import Config, adaptation, configured, reconstructing
 from tofuse.engine.mapping import Mapper as OnlineMapper
 from tofuse.engine.parts import name_of
 from tofuse.engine.progress import Progress, Silent, receiver

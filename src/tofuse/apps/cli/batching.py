@@ -75,10 +75,7 @@ def _command_line(arguments: Batch, job: Job) -> str:
 
 
 def _run(
-    arguments: Batch,
-    jobs: Sequence[Job],
-    remaining: Sequence[Job],
-    folder: BatchFolder,
+    arguments: Batch, jobs: Sequence[Job], remaining: Sequence[Job], folder: BatchFolder
 ) -> None:
     if arguments.scheduler is None:
         count = min(arguments.workers or 1, len(remaining))

@@ -26,11 +26,7 @@ from tofuse.formats.poses import read_pose
 T = TypeVar("T")
 COMPARED, REPEATED = "compare.json", "repeat.json"
 COMPARE_CONTRACT = folders.Contract.of_files(
-    COMPARED,
-    "deviations.csv",
-    "deviations.ply",
-    "report.html",
-    keys=("regions", "tolerance_m"),
+    COMPARED, "deviations.csv", "deviations.ply", "report.html", keys=("regions", "tolerance_m")
 )
 REPEAT_CONTRACT = folders.Contract.of_files(REPEATED, "repeat.csv", keys=("components", "bounds"))
 _STATUS = {None: 0, "pass": 0, "fail": 3, "undecided": 4}
@@ -138,11 +134,7 @@ def _done(
     contract: folders.Contract,
 ) -> T:
     """Do the work, and write what was found if there is a folder for it, which is checked first."""
-    with (
-        threads(options.threads),
-        threadpool_limits(1),
-        options.folder(contract) as folder,
-    ):
+    with threads(options.threads), threadpool_limits(1), options.folder(contract) as folder:
         found = work()
         if folder is not None:
             with folder.staging() as staging:

@@ -160,12 +160,7 @@ def _of_record(record: GeometryRecord, name: str) -> Surface:
         view = CloudFrame.of(points)
         normals = np.nan_to_num(surface_shape.normals_at(view, np.arange(len(points))))
     return Surface(
-        name,
-        points,
-        normals,
-        faces,
-        oriented,
-        None if sigma is None else sigma.astype(np.float64),
+        name, points, normals, faces, oriented, None if sigma is None else sigma.astype(np.float64)
     )
 
 

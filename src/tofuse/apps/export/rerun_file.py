@@ -82,8 +82,7 @@ def _layout(views: Any) -> Any:
     model = views.Spatial3DView(contents=["+ /**", "- /world/cloud", "- /world/sigma"])
     images = [views.Spatial2DView(origin=f"world/camera/{name}") for name in ("image", "depth")]
     return views.Blueprint(
-        views.Horizontal(model, views.Vertical(*images), column_shares=[3, 1]),
-        collapse_panels=True,
+        views.Horizontal(model, views.Vertical(*images), column_shares=[3, 1]), collapse_panels=True
     )
 
 

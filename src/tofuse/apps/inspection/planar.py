@@ -124,10 +124,7 @@ def _labels(view: PreparedView, is_valid: Bool) -> Int64:
         _MAX_PLANE_FRACTION, _MAX_PLANE_SIGMAS * view.sigma / np.maximum(view.z, 1e-3)
     )
     links = []
-    for a, b in (
-        (np.s_[:, 1:], np.s_[:, :-1]),
-        (np.s_[1:], np.s_[:-1]),
-    ):
+    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
         is_same = is_valid[a] & is_valid[b]
         is_same &= (normals[a] * normals[b]).sum(-1) > _MIN_NORMAL_COSINE
         predicted_w = (planes[b][..., :2] * rays[a]).sum(-1) + planes[b][..., 2]

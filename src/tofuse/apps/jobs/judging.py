@@ -31,13 +31,7 @@ from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.errors import InputError, signals_as_themselves
 from tofuse.engine.frames import Frame, Recording, Source, evenly_spaced, frame_ranges
 from tofuse.engine.geometry import se3
-from tofuse.engine.mapping import (
-    Config,
-    adaptation,
-    clips,
-    from_method,
-    reconstructing,
-)
+from tofuse.engine.mapping import Config, adaptation, clips, from_method, reconstructing
 from tofuse.engine.parts import check_number
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.quality import (
@@ -509,10 +503,7 @@ class JudgeOptions(OpeningOptions, folders.OutputOptions):
 
 
 def judge_files(
-    inputs: Sequence[str | Path],
-    trajectory: Path,
-    options: JudgeOptions,
-    progress: Progress,
+    inputs: Sequence[str | Path], trajectory: Path, options: JudgeOptions, progress: Progress
 ) -> Judgement:
     """Judge the poses in a file, and write the refined result if an output folder is given.
 

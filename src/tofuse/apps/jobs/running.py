@@ -26,13 +26,7 @@ from tofuse.engine.loops import PriorLoop
 from tofuse.engine.mapping import Config, adaptation, reconstructing
 from tofuse.engine.normal import OF_99_PERCENT
 from tofuse.engine.progress import Progress, Silent
-from tofuse.engine.results import (
-    Reason,
-    Reconstruction,
-    SelfCalibration,
-    in_main_model,
-    verdicts,
-)
+from tofuse.engine.results import Reason, Reconstruction, SelfCalibration, in_main_model, verdicts
 from tofuse.engine.sensor import Unwrap
 from tofuse.engine.stopwatch import timing
 from tofuse.formats.files import stamps

@@ -143,15 +143,8 @@ def predict(
     points_of_none, none = np.zeros((0, 3)), np.zeros(0)
     parts = [
         Prediction(
-            points_of_none,
-            none,
-            none,
-            none,
-            none,
-            none,
-            np.zeros(0, np.int64),
-            np.zeros(0, bool),
-        ),
+            points_of_none, none, none, none, none, none, np.zeros(0, np.int64), np.zeros(0, bool)
+        )
     ]
     first = 0
     for view in views:

@@ -251,11 +251,7 @@ def _packed_texture(texture: Textured | None) -> dict[str, Any]:
         return {"uv": None, "texture": None, "filled": 0}
     uv = quantized(texture.atlas.uv.astype(float), np.zeros(2), np.ones(2))
     image = base64.b64encode(jpeg_bytes(texture.image, QUALITY)).decode()
-    return {
-        "uv": pack(uv),
-        "texture": f"data:image/jpeg;base64,{image}",
-        "filled": texture.filled,
-    }
+    return {"uv": pack(uv), "texture": f"data:image/jpeg;base64,{image}", "filled": texture.filled}
 
 
 def _display_colors(mesh: Mesh | None) -> Mesh | None:

@@ -188,10 +188,7 @@ def filters(s: Subject) -> Values:
 
 
 def _step_images(
-    frame: Frame,
-    previous: Frame | None,
-    limits: tuple[float, float],
-    view: tuple[Float64, float],
+    frame: Frame, previous: Frame | None, limits: tuple[float, float], view: tuple[Float64, float]
 ) -> list[str]:
     """The depth image of a frame, with the pixels removed since the previous one; its points."""
     images = []

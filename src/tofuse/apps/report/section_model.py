@@ -58,10 +58,7 @@ def model(s: Subject) -> Values:
             "normals": scene.mesh is not None or scene.normals is not None,
             **{name: len(getattr(scene, name)) for name in _SWITCHED},
         },
-        "colorings": [
-            ("", _color_source(s)),
-            *((field.name, field.label) for field in shown),
-        ],
+        "colorings": [("", _color_source(s)), *((field.name, field.label) for field in shown)],
         "cameras": list(zip(names, colors, strict=True)),
         "thinned": thinned,
     }

@@ -78,10 +78,7 @@ def write_result(
 
 
 def _write_files(
-    result: Reconstruction,
-    folder: Path,
-    report: Report | None,
-    texture: Textured | None,
+    result: Reconstruction, folder: Path, report: Report | None, texture: Textured | None
 ) -> None:
     # Both release the interpreter lock for much of their time.
     with job_pool(1, "tofuse-writer") as background:

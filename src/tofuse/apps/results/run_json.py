@@ -300,9 +300,7 @@ def main_poses(folder: Path, run: dict[str, Any]) -> tuple[list[int], Float64]:
         problem = "has other timestamps than trajectory.txt"
     if problem is not None:
         raise InputError(
-            problem,
-            where=folder / "run.json",
-            remedy="copy the whole folder, or run again",
+            problem, where=folder / "run.json", remedy="copy the whole folder, or run again"
         )
     return indices, se3.about(-shift_of(run, folder / "run.json"), poses)
 

@@ -95,11 +95,7 @@ def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> Calibrati
     rows = [RigCamera(cameras[0].name, cameras[0].recording.path, np.eye(4), np.zeros((6, 6)))]
     rows += [
         RigCamera(
-            cameras[k].name,
-            cameras[k].recording.path,
-            fit.T_a_b,
-            fit.covariance,
-            fit.time_offset_s,
+            cameras[k].name, cameras[k].recording.path, fit.T_a_b, fit.covariance, fit.time_offset_s
         )
         for k, fit in sorted(fits.items())
     ]

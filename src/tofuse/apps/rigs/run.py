@@ -184,11 +184,7 @@ def reconstruct_rig(
 
 
 def _calibration_edges(
-    recording: Recording,
-    instant: Intp,
-    T_world_frame: Float64,
-    *,
-    follow: bool,
+    recording: Recording, instant: Intp, T_world_frame: Float64, *, follow: bool
 ) -> list[Measured]:
     """Return edges from the first camera's frame of each instant to the others, with information.
 

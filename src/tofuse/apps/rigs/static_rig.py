@@ -14,12 +14,7 @@ from scipy.special import stdtr
 
 from tofuse.apps.rigs.clocks import lag_between
 from tofuse.apps.rigs.inputs import Calibration, Camera, disagreement_rows
-from tofuse.apps.rigs.joint import (
-    RigView,
-    distances_between,
-    refine_together,
-    refined_poses,
-)
+from tofuse.apps.rigs.joint import RigView, distances_between, refine_together, refined_poses
 from tofuse.apps.rigs.placing import place
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.errors import InputError

@@ -58,10 +58,7 @@ def serve(port: int | None = None) -> ViserServer:
             remedy="pip install 'viser==1.1.1'",
         )
     server.gui.configure_theme(
-        control_width="medium",
-        dark_mode=True,
-        show_logo=False,
-        show_share_button=False,
+        control_width="medium", dark_mode=True, show_logo=False, show_share_button=False
     )
     return server
 

@@ -122,10 +122,7 @@ class Patches:
 
 
 def patches(
-    source: PreparedView,
-    targets: Sequence[Target],
-    aligned: Aligned,
-    alignment: ProjectiveOptions,
+    source: PreparedView, targets: Sequence[Target], aligned: Aligned, alignment: ProjectiveOptions
 ) -> Patches:
     """Return the sums over the patches of an aligned view.
 

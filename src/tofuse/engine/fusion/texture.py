@@ -27,12 +27,7 @@ from tofuse.engine.fusion.atlas_kernels import (
 )
 from tofuse.engine.fusion.cloud import NO_COLOR, grey_of, has_color
 from tofuse.engine.fusion.color_alignment import Shown, aligned_poses
-from tofuse.engine.fusion.display_surface import (
-    TOLERANCE_FRACTION,
-    TOLERANCE_M,
-    reduced,
-    reduction,
-)
+from tofuse.engine.fusion.display_surface import TOLERANCE_FRACTION, TOLERANCE_M, reduced, reduction
 from tofuse.engine.fusion.drawing import display_colors
 from tofuse.engine.fusion.mesh import Mesh
 from tofuse.engine.geometry import KdTree, se3

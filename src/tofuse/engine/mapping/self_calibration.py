@@ -20,13 +20,7 @@ from tofuse.engine.mapping.config import Config
 from tofuse.engine.progress import Progress
 from tofuse.engine.quantities import length
 from tofuse.engine.refinement import calibration_check
-from tofuse.engine.results import (
-    Diagnostics,
-    Reason,
-    Reconstruction,
-    SelfCalibration,
-    verdicts,
-)
+from tofuse.engine.results import Diagnostics, Reason, Reconstruction, SelfCalibration, verdicts
 from tofuse.engine.sensor import ERROR_OPTIONS, CameraErrors
 
 # The first estimate uses poses that the error has distorted, the second one does not.

@@ -35,10 +35,7 @@ from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import RangeFrame, Recording, evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.trajectory_errors import finite_or_none
-from tofuse.engine.quality.view_agreement_kernels import (
-    agreement_sums,
-    transform_points,
-)
+from tofuse.engine.quality.view_agreement_kernels import agreement_sums, transform_points
 from tofuse.engine.sensor import Corrector
 
 MAX_COLUMNS = 320

@@ -25,12 +25,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
 from tofuse.engine.quantities import length, percent
-from tofuse.engine.refinement.camera_response import (
-    SECTIONS,
-    SIGNIFICANT,
-    Linearised,
-    Posterior,
-)
+from tofuse.engine.refinement.camera_response import SECTIONS, SIGNIFICANT, Linearised, Posterior
 from tofuse.engine.refinement.joint_alignment import (
     AlignedViews,
     Priors,
@@ -47,13 +42,7 @@ from tofuse.engine.stored_views import pair_equation_kernels as kernels
 
 # Multipath and mixed pixels look like an error of the focal length of up to a percent; cameras are
 # calibrated to better than that. Makers specify depth offsets of up to a centimetre.
-TOLERANCES = {
-    "focal": 0.01,
-    "offset": 0.01,
-    "center_x": 0.01,
-    "center_y": 0.01,
-    "distortion": 0.01,
-}
+TOLERANCES = {"focal": 0.01, "offset": 0.01, "center_x": 0.01, "center_y": 0.01, "distortion": 0.01}
 # What they are errors of.
 QUANTITIES = {
     "focal": "focal length",

@@ -12,12 +12,7 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.engine.search import pair_agreement, pose_probability, verification
     from tofuse.engine.search.plane_detection import Plane, detect_planes
-    from tofuse.engine.search.search import (
-        DISTINCT_M,
-        DISTINCT_RAD,
-        Search,
-        are_distinct_poses,
-    )
+    from tofuse.engine.search.search import DISTINCT_M, DISTINCT_RAD, Search, are_distinct_poses
     from tofuse.engine.search.search_grid import SearchOptions
     from tofuse.engine.search.search_kernels import ViewPoints
     from tofuse.engine.search.view_pair import follow, register_pair

@@ -277,11 +277,7 @@ def _non_maximum_suppression(
 
 
 def refine_poses(
-    s: ResampledView,
-    t: ResampledView,
-    poses: Float64,
-    reaches: Float64,
-    points: int,
+    s: ResampledView, t: ResampledView, poses: Float64, reaches: Float64, points: int
 ) -> None:
     """Refine poses (N, 4, 4) in place by two-way ICP."""
     source, target = s.subset(points), t.subset(points)

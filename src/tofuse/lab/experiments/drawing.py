@@ -139,10 +139,7 @@ def plan(box: Float64, view: str, width: int) -> Any:
     (a, sa), (b, sb) = plots.VIEWS[view]
     # In metres, the ticks of a camera that hardly moves would need three digits.
     unit, per_m = ("mm", 1000) if max(extent) < _MAX_MM_EXTENT_M else ("m", 1)
-    for axis, sign, k, ticks in (
-        (axes.xaxis, sa, a, inner / 60),
-        (axes.yaxis, sb, b, height / 40),
-    ):
+    for axis, sign, k, ticks in ((axes.xaxis, sa, a, inner / 60), (axes.yaxis, sb, b, height / 40)):
         axis.set_major_locator(locator(ticks))
         axis.set_major_formatter(partial(_tick, by=sign * per_m))
         axis.set_label_text(f"{plots.AXIS_NAMES[k]}, {unit}", color=MUTED, fontsize=10.5)

@@ -10,13 +10,7 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.frames import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import (
-    Measured,
-    PoseGraph,
-    build_graph,
-    castellani,
-    external_sensors,
-)
+from tofuse.engine.graph import Measured, PoseGraph, build_graph, castellani, external_sensors
 from tofuse.engine.icp import CoarseToFine, algorithm_1
 from tofuse.engine.mapping import default, reconstructing
 from tofuse.engine.refinement import plane_refinement

@@ -251,11 +251,7 @@ def peaks_section(sweep: PeaksSweep) -> dict[str, Any]:
     for k, s in enumerate(sweep.sigmas):
         angle = np.degrees(sweep.rotation[k])
         rows.append(
-            [
-                f"{s:.2f}",
-                *(f"{v:.3f}" for v in sweep.position[k]),
-                *(f"{v:.2f}" for v in angle),
-            ]
+            [f"{s:.2f}", *(f"{v:.3f}" for v in sweep.position[k]), *(f"{v:.2f}" for v in angle)]
         )
     return {
         "rows": rows,

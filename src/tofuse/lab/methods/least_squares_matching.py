@@ -181,10 +181,7 @@ class LeastSquaresMatching(Bounded, Registrar):
         return np.vstack([A, _jacobian(centred, unit * foot.gradient)]), np.r_[foot.distance, r]
 
     def _foot_points(
-        self,
-        x: Float64,
-        model: interfaces.Points,
-        intensity: tuple[Float64, Float64] | None,
+        self, x: Float64, model: interfaces.Points, intensity: tuple[Float64, Float64] | None
     ) -> _FootPoints:
         """Foot points of x (n, 3) on the triangles around the nearest points of the target."""
         surface = neighbourhood(model)

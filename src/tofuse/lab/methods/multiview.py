@@ -19,12 +19,7 @@ from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.graph import PoseGraph, external_sensors
 from tofuse.engine.icp import icp_kernels, surface_shape
-from tofuse.engine.refinement import (
-    Refinement,
-    RefinementMethod,
-    Refiner,
-    plane_refinement,
-)
+from tofuse.engine.refinement import Refinement, RefinementMethod, Refiner, plane_refinement
 from tofuse.engine.stored_views import Spacing, ViewStore
 from tofuse.engine.views import PreparedView
 

@@ -14,12 +14,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.icp import Icp, icp_kernels, icp_parts, surface_metrics
 from tofuse.engine.parts import part
 from tofuse.lab.methods.compatibility import Boundary
-from tofuse.lab.methods.multiview import (
-    Cloud,
-    Pairs,
-    RelaxationMethod,
-    resolution_of,
-)
+from tofuse.lab.methods.multiview import Cloud, Pairs, RelaxationMethod, resolution_of
 
 # Approximate number of concrete pairs per registered pair of views, and max updates of a view.
 _PAIRS_PER_CONSTRAINT, _MAX_UPDATES = 200, 200

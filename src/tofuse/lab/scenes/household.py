@@ -91,10 +91,7 @@ def shelf(
 
 
 def table(
-    assembly: Assembly,
-    wood: Material,
-    size: tuple[float, float] = (0.8, 1.2),
-    height: float = 0.74,
+    assembly: Assembly, wood: Material, size: tuple[float, float] = (0.8, 1.2), height: float = 0.74
 ) -> None:
     """Add a table on four legs."""
     x, y = size[0] / 2, size[1] / 2

@@ -149,10 +149,7 @@ class CameraModel:
         return (
             (self.modulation_hz,)
             if self.unwrap_hz is None
-            else (
-                self.modulation_hz,
-                self.unwrap_hz,
-            )
+            else (self.modulation_hz, self.unwrap_hz)
         )
 
     @property

@@ -189,11 +189,7 @@ def _mirrored(gloss: Float64, cosine: Float64) -> Float64:
 
 
 def direct_irradiance(
-    scene: Scene,
-    lamp: Float64,
-    points: Float64,
-    normals: Float64,
-    T_room_bodies: Float64 | None,
+    scene: Scene, lamp: Float64, points: Float64, normals: Float64, T_room_bodies: Float64 | None
 ) -> tuple[Float64, Float64]:
     """Irradiance of points (N, 3) by a lamp (3,): cos / r^2, 0 in shadow; and distances r in m."""
     toward = points - lamp

@@ -285,11 +285,7 @@ def _in_depth_kind(model: CameraModel, radial: Float64) -> Float32:
 
 
 def _frame(
-    model: CameraModel,
-    effects: Effects,
-    measured: sensor.Measurement,
-    index: int,
-    time_s: float,
+    model: CameraModel, effects: Effects, measured: sensor.Measurement, index: int, time_s: float
 ) -> RangeFrame:
     depth = np.where(measured.saturated, 0, _in_depth_kind(model, measured.range_m))
     if effects.under_exposure:

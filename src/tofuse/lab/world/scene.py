@@ -170,10 +170,7 @@ class Scene:
         return sum(len(body.mesh.faces) for body in (self._room, *self._moving))
 
     def cast(
-        self,
-        origins: ArrayLike,
-        directions: ArrayLike,
-        T_room_bodies: ArrayLike | None = None,
+        self, origins: ArrayLike, directions: ArrayLike, T_room_bodies: ArrayLike | None = None
     ) -> Hits:
         """Return the first hit of each ray.
 
