@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -23,7 +23,6 @@ from tofuse.formats.files import atomic
 from tofuse.formats.geometry import write_ply
 from tofuse.formats.poses import read_pose
 
-T = TypeVar("T")
 COMPARED, REPEATED = "compare.json", "repeat.json"
 COMPARE_CONTRACT = folders.Contract.of_files(
     COMPARED, "deviations.csv", "deviations.ply", "report.html", keys=("regions", "tolerance_m")
@@ -60,10 +59,9 @@ def compare_files(
     OutputError
         If the result can't be written; existing files are then unchanged.
     """
-
-    def work() -> Comparison:
+    with threads(options.threads), threadpool_limits(1), options.folder(COMPARE_CONTRACT) as folder:
         progress.stage("comparing")
-        return compare(
+        comparison = compare(
             result,
             reference,
             tolerance_m=options.tolerance,
@@ -71,12 +69,11 @@ def compare_files(
             accuracy_m=options.accuracy,
             unit=options.unit,
         )
-
-    def write(comparison: Comparison, folder: Path) -> None:
-        progress.stage("writing")
-        write_comparison(comparison, folder)
-
-    return _done(work, write, options, COMPARE_CONTRACT)
+        if folder is not None:
+            progress.stage("writing")
+            with folder.staging() as staging:
+                write_comparison(comparison, staging)
+    return comparison
 
 
 def compare_exit_status(comparison: Comparison) -> int:
@@ -112,34 +109,17 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
 
 def repeat_files(results: Sequence[Path], options: RepeatOptions, progress: Progress) -> Repetition:
     """Compare results of the same place, and write what was found; see `repeated` for errors."""
-
-    def work() -> Repetition:
+    with threads(options.threads), threadpool_limits(1), options.folder(REPEAT_CONTRACT) as folder:
         progress.stage("reading", len(results))
         sessions = loaded_sessions(results, progress)
         progress.stage("comparing")
-        return repeated(sessions)
-
-    def write(repetition: Repetition, folder: Path) -> None:
-        rows = [vars(component) for component in repetition.components]
-        atomic.write_text(folder / "repeat.csv", _table(rows))
-        run_json.write_object(folder / REPEATED, repetition.to_dict())
-
-    return _done(work, write, options, REPEAT_CONTRACT)
-
-
-def _done(
-    work: Callable[[], T],
-    write: Callable[[T, Path], None],
-    options: CompareOptions | RepeatOptions,
-    contract: folders.Contract,
-) -> T:
-    """Do the work, and write what was found if there is a folder for it, which is checked first."""
-    with threads(options.threads), threadpool_limits(1), options.folder(contract) as folder:
-        found = work()
+        repetition = repeated(sessions)
         if folder is not None:
             with folder.staging() as staging:
-                write(found, staging)
-    return found
+                rows = [vars(component) for component in repetition.components]
+                atomic.write_text(staging / "repeat.csv", _table(rows))
+                run_json.write_object(staging / REPEATED, repetition.to_dict())
+    return repetition
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -197,16 +197,8 @@ def repeated(sessions: Sequence[Session], *, searched: bool = True) -> Repetitio
                 raise InputError(comparison.reason, where=session.name, remedy="leave it out")
             T = comparison.deviations.T_reference_measured
         shared = session.surface.shared_m or 0.0
-        at = mapped(
-            measured_points(session.surface, reference),
-            reference,
-            T,
-            reach,
-            None,
-            shared,
-            0,
-            places,
-        ).places
+        measured = measured_points(session.surface, reference)
+        at = mapped(measured, reference, T, reach, shared_m=shared, centres=places).places
         poses.append(T)
         deviation.append(at.deviation)
         sigma.append(at.sigma)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from tofuse.apps.results import folders, write_result
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.compute import threads as use_threads
-from tofuse.engine.frames import Recording, Source
+from tofuse.engine.frames import Recording
 from tofuse.engine.fusion import Textured
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import external_sensors
@@ -167,19 +168,13 @@ def merge_sessions(
 
 def joined_recording(sessions: Sequence[Session]) -> tuple[Recording, list[int]]:
     """Return the recordings of all sessions as one, and the first frame index of each."""
-    sources: list[Source] = []
-    names: list[str] = []
-    offsets, count = [], 0
-    for session in sessions:
-        source = session.recording.source
-        offsets.append(count)
-        count += len(source.timestamps)
-        sources.append(source)
-        names.append(session.name)
+    sources = [session.recording.source for session in sessions]
+    counts = [len(source.timestamps) for source in sources]
+    offsets = list(accumulate(counts, initial=0))[:-1]
     indices = [s.recording.indices + offset for s, offset in zip(sessions, offsets, strict=True)]
     formats = dict.fromkeys(s.recording.format for s in sessions)
     path = " ".join(s.recording.path for s in sessions)
-    joined = JoinedSource(sources, names)
+    joined = JoinedSource(sources, [session.name for session in sessions])
     return Recording(joined, path, "+".join(formats), np.concatenate(indices)), offsets
 
 

@@ -83,7 +83,7 @@ def fields(scene: Scene, errors: Float64 | None = None) -> list[Field]:
     views = scene.views if mesh is None else mesh.views
     available = [] if sigma is None else [accuracy(OF_95_PERCENT * sigma.astype(float), errors)]
     low, high = percentile_range(-points[:, 1])
-    ticks = (length(0.0), length((high - low) / 2), length(high - low))
+    ticks = length(0.0), length((high - low) / 2), length(high - low)
     available.append(Field("height", "Height", -points[:, 1], low, high, ticks, (low, high)))
     if views is not None:
         counts = views.astype(float)
