@@ -47,12 +47,11 @@ class Kinect2(Reader):
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
         files = inputs.required(reading.files_named(path, _DEPTH.fullmatch), "NNNN_depth.png", path)
-        color = [_color(file) for file in files]
         source = DepthImageSource(
             files,
             np.arange(len(files), dtype=float),
             None if options.camera else _camera(path, first_size(files)),
-            color=color if any(color) else None,
+            color=[_color(file) for file in files],
             sensor="Kinect v2 (ToF)",
             options=options,
         )

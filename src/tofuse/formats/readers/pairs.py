@@ -37,12 +37,11 @@ class Pairs(Reader):
         files = reading.files_named(path, _DEPTH.fullmatch)
         inputs.required(files, "*-depth.png or depth*.png", path)
         camera = camera_file.camera_file_of(path, options.camera, "neither lens nor unit")
-        color = [_color(file) for file in files]
         return DepthImageSource(
             files,
             np.arange(len(files), dtype=float),
             None,
-            color=color if any(color) else None,
+            color=[_color(file) for file in files],
             options=ReaderOptions(camera),
         )
 

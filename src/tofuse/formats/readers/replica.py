@@ -47,7 +47,7 @@ class Replica(Reader):
             np.arange(len(files), dtype=float),
             lens,
             depth_unit_m=unit,
-            color=color if any(color) else None,
+            color=color,
             options=options,
         )
         if reading.is_file(path / _POSES):

@@ -198,7 +198,8 @@ class DepthImageSource(FileSource):
         options: ReaderOptions | None = None,
     ) -> None:
         super().__init__(timestamps)
-        self.files, self.color = list(files), None if color is None else list(color)
+        self.files = list(files)
+        self.color = [None] * len(files) if color is None else list(color)
         self.color_registered, self.color_camera = color_registered, color_camera
         where = "the camera of this format"
         if options is not None and options.camera is not None:
@@ -214,7 +215,7 @@ class DepthImageSource(FileSource):
         self.metadata |= {"depth_unit_m": self.unit, "depth_kind": self.kind}
         if sensor:
             self.metadata["sensor"] = sensor
-        self.note_missing_color(self.color or ())
+        self.note_missing_color(self.color)
         remedy = "pass the camera of these images with --camera"
         check_first_size(self.files, size, where, remedy)
 
@@ -223,7 +224,7 @@ class DepthImageSource(FileSource):
         size = (self.camera.width, self.camera.height)
         counts = self.read_counts(index, size)
         frame = self.image(index, depth_counts.depth_from_counts(counts, self.unit))
-        path = None if self.color is None else self.color[index]
+        path = self.color[index]
         if path is None:
             return frame
         return replace(
@@ -234,7 +235,7 @@ class DepthImageSource(FileSource):
 
     def has_color(self, index: int) -> bool:
         """See `FileSource.has_color`."""
-        return self.color is not None and self.color[index] is not None
+        return self.color[index] is not None
 
     def read_counts(self, index: int, size: tuple[int, int]) -> UInt16:
         """Return the image (H, W) of a frame, in counts of depth."""
