@@ -14,7 +14,7 @@ from tofuse.apps.report.packing import normal_bytes, pack, quantized
 from tofuse.apps.results import QUALITY, viridis
 from tofuse.engine.arrays import Float32, Float64, Int32, Intp, UInt8, UInt16
 from tofuse.engine.fusion import Cloud, Mesh, Textured, drawing
-from tofuse.engine.geometry import se3, triangles, unit_vectors
+from tofuse.engine.geometry import se3, sphere_directions, triangles, unit_vectors
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.images import jpeg_bytes
 
@@ -361,11 +361,7 @@ def extreme_points(points: Float64, outer: float) -> Float64:
     low, high = np.percentile(points, [outer, 100 - outer], axis=0)
     inside = points[((points >= low) & (points <= high)).all(1)]
     points = inside if len(inside) else points
-    k = np.arange(_DIRECTIONS) + 0.5
-    height, azimuth = 1 - 2 * k / _DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
-    radius = np.sqrt(1 - height**2)
-    directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
-    return points[np.unique((points @ directions).argmax(0))]
+    return points[np.unique((points @ sphere_directions(_DIRECTIONS).T).argmax(0))]
 
 
 def random_subset(count: int, max_count: int) -> Intp:
@@ -393,6 +389,5 @@ def spacing_of(points: Float64) -> float:
         return 0.01
     from scipy.spatial import cKDTree
 
-    sampled = points[:: max(1, len(points) // 2000)]
-    distances, _ = cKDTree(points).query(sampled, k=2)
+    distances, _ = cKDTree(points).query(points[:: max(1, len(points) // 2000)], k=2)
     return float(max(np.median(distances[:, 1]), 1e-5))

@@ -81,7 +81,10 @@ def percentile_range(values: NDArray[np.floating], min_width: float = 0.0) -> tu
 
 
 def depth_image(
-    frame: RangeFrame, limits: tuple[float, float], removed: Bool | None, width: int | None = None
+    frame: RangeFrame,
+    limits: tuple[float, float] | None = None,
+    removed: Bool | None = None,
+    width: int | None = None,
 ) -> UInt8:
     """Return the z depth in colours (H, W, 3); pixels without a measurement are grey.
 
@@ -90,14 +93,16 @@ def depth_image(
     frame
         The frame.
     limits
-        Depths at the ends of the colour map, m.
+        Depths at the ends of the colour map, m; by default those of `depth_limits`.
     removed
-        (H, W) pixels to be marked; or None.
+        (H, W) pixels to be marked.
     width
         Maximum width; wider images are subsampled.
     """
     step = 1 if width is None else -(-frame.z.shape[1] // width)
-    image = depth_colors(frame.z[::step, ::step], frame.valid[::step, ::step], limits)
+    image = depth_colors(
+        frame.z[::step, ::step], frame.valid[::step, ::step], limits or depth_limits(frame)
+    )
     if removed is not None:
         image[removed[::step, ::step]] = REMOVED
     return image
@@ -153,8 +158,7 @@ def splat(
     width, height = size
     pixels, z = project(points, T_view_world, size, scale=scale, distance=distance)
     u, v = np.rint(pixels).T
-    shown = (u >= 0) & (v >= 0) & (u < width) & (v < height) & (z > -np.inf)
-    rows = np.flatnonzero(shown)
+    rows = np.flatnonzero((u >= 0) & (v >= 0) & (u < width) & (v < height) & (z > -np.inf))
     rows = rows[np.argsort(-z[rows], kind="stable")]
     # Squares may reach beyond the image, to the right and below.
     order = np.full((height + radius, width + radius), -1)
@@ -239,5 +243,4 @@ def cloud_image(
     depth = points[:, 2] if is_range else np.linalg.norm(points - frame.origin, axis=1)
     low, high = limits
     T, scale = view or framing(points, size)
-    colors = viridis((depth - low) / (high - low))
-    return splat(points, colors, T, size, scale=scale, radius=2)
+    return splat(points, viridis((depth - low) / (high - low)), T, size, scale=scale, radius=2)

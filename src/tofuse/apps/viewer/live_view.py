@@ -207,7 +207,7 @@ class LiveView(Progress):
         if isinstance(frame, RangeFrame):
             frame_image = frame.color_image
             if frame_image is None:
-                frame_image = thumbnails.depth_image(frame, thumbnails.depth_limits(frame), None)
+                frame_image = thumbnails.depth_image(frame)
             image = thumbnails.subsample(frame_image, _IMAGE_WIDTH)
             source = thumbnails.data_uri(image, jpeg=True)
             self._image.content = (

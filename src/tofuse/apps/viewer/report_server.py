@@ -72,9 +72,7 @@ class FrameImages:
             return thumbnails.encode(frame.color_image)
         if frame.amplitude_image is not None:
             return thumbnails.encode(thumbnails.grey(frame.amplitude_image))
-        return thumbnails.encode(
-            thumbnails.depth_image(frame, thumbnails.depth_limits(frame), None)
-        )
+        return thumbnails.encode(thumbnails.depth_image(frame))
 
 
 def report_pages(folder: Path) -> dict[str, tuple[str, bytes]]:

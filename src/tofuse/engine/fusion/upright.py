@@ -6,7 +6,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.fusion.mesh import Mesh
-from tofuse.engine.geometry import se3
+from tofuse.engine.geometry import se3, sphere_directions
 
 # Number of sampled vertices, and of candidate planes through them.
 _MAX_POINTS, _MAX_CANDIDATES = 4000, 150
@@ -86,23 +86,13 @@ def likely_up(mesh: Mesh | None, poses: Float64) -> Float64:
     else:
         normals = mesh.normals[:: -(-len(mesh) // _MAX_NORMALS)].astype(float)
         normals = normals[np.isfinite(normals).all(1)]
+    candidates = sphere_directions(_DIRECTIONS)
     if np.linalg.norm(mean_up) > 0.1:  # the mean of the cameras is a candidate, too
-        candidates = np.concatenate([[mean_up / np.linalg.norm(mean_up)], _directions()])
-    else:
-        candidates = _directions()
+        candidates = np.concatenate([[mean_up / np.linalg.norm(mean_up)], candidates])
     score = _camera_score(R_world_camera, candidates) + _STRUCTURE_WEIGHT * _structure_score(
         normals, candidates
     )
-    best = candidates[int(score.argmax())]
-    return _refined(normals, best)
-
-
-def _directions() -> Float64:
-    """Return unit vectors (N, 3), evenly over the sphere."""
-    k = np.arange(_DIRECTIONS) + 0.5
-    z, azimuth = 1 - 2 * k / _DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
-    radius = np.sqrt(1 - z**2)
-    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], -1)
+    return _refined(normals, candidates[int(score.argmax())])
 
 
 def _camera_score(R_world_camera: Float64, ups: Float64) -> Float64:

@@ -25,6 +25,14 @@ def unit_vectors(vectors: ArrayLike) -> Float64:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
 
 
+def sphere_directions(count: int) -> Float64:
+    """Return unit vectors (count, 3), evenly over the sphere: a Fibonacci lattice."""
+    k = np.arange(count) + 0.5
+    z, azimuth = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
+    radius = np.sqrt(1 - z**2)
+    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], -1)
+
+
 def tangents(normals: ArrayLike) -> Float64:
     """Return two unit vectors (..., 2, 3) perpendicular to each normal (..., 3) and each other."""
     normals = np.asarray(normals, float)
