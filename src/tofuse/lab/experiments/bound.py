@@ -75,5 +75,4 @@ def mean_distance(covariances: Float64) -> float:
     """Mean length of normal vectors with covariances (N, 3, 3), over all of them."""
     values = np.linalg.eigvalsh(covariances)
     draws = np.random.default_rng([0]).normal(size=(_DRAWS, 1, 3))
-    lengths = np.linalg.norm(draws * np.sqrt(np.maximum(values, 0)), axis=2)
-    return float(lengths.mean())
+    return float(np.linalg.norm(draws * np.sqrt(np.maximum(values, 0)), axis=2).mean())

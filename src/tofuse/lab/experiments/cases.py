@@ -120,6 +120,15 @@ class Model:
 
 
 @dataclass(frozen=True, eq=False)
+class Estimate:
+    """Poses (N, 4, 4) T_world_camera, NaN where lost, their errors, and their model."""
+
+    poses: Float64
+    score: PathScore
+    model: Model
+
+
+@dataclass(frozen=True, eq=False)
 class Run:
     """One reconstruction.
 
@@ -127,12 +136,12 @@ class Run:
     ----------
     draw
         Index of the draw of the random points: its seed minus that of the scene.
-    truth, before, after
-        (N, 4, 4) T_world_camera: true, chained, and optimised; NaN where lost.
+    truth
+        (N, 4, 4) true T_world_camera.
+    before, after
+        The chained and the optimised estimate; points are stored for the first draw only.
     loop
         Whether the manually given loop was confirmed, and why.
-    model_before, model_after
-        Models of the two; points are stored for the first draw only.
     """
 
     case: str
@@ -141,21 +150,17 @@ class Run:
     stride: int
     draw: int
     truth: Float64
-    before: Float64
-    after: Float64
+    before: Estimate
+    after: Estimate
     loop: tuple[bool, str]
     objective: tuple[float, ...]
     verdict: str
-    score_before: PathScore
-    score_after: PathScore
-    model_before: Model
-    model_after: Model
     seconds: float
 
     @property
     def posed(self) -> int:
         """Number of frames with a pose."""
-        return int(np.isfinite(self.before[:, 0, 0]).sum())
+        return int(np.isfinite(self.before.poses[:, 0, 0]).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,9 +304,16 @@ def _run(
     seconds = perf_counter() - start
     assert recording.reference is not None
     truth = recording.reference
-    before, after = result.diagnostics.sequential, result.trajectory
     frames = list(recording)
     keep_points = draw == 0 and stride == case.stride
+    before, after = (
+        Estimate(
+            poses,
+            measures.score_path(poses, truth),
+            build_model(case, recorded, frames, poses, keep_points=keep_points),
+        )
+        for poses in (result.diagnostics.sequential, result.trajectory)
+    )
     record = next(iter(result.diagnostics.loops), None)
     return Run(
         case.scene,
@@ -315,10 +327,6 @@ def _run(
         (False, "too short") if record is None else (record.accepted, record.reason),
         result.diagnostics.objective,
         result.diagnostics.verdict,
-        measures.score_path(before, truth),
-        measures.score_path(after, truth),
-        build_model(case, recorded, frames, before, keep_points=keep_points),
-        build_model(case, recorded, frames, after, keep_points=keep_points),
         seconds,
     )
 
@@ -333,8 +341,7 @@ def build_model(
 ) -> Model:
     """Merge frames by poses (N, 4, 4), NaN where lost, and measure the model."""
     assert poses is not None
-    total = sum(len(f) for f in frames)
-    step = max(1, -(-total // _MODEL_POINTS))
+    step = max(1, -(-sum(len(f) for f in frames) // _MODEL_POINTS))
     parts = [
         se3.transform(recorded.T_truth_world @ T, frame.points[::step])
         for frame, T in zip(frames, poses, strict=True)
@@ -409,8 +416,7 @@ def _door(recorded: RecordedScene, recording: Recording) -> dict[str, float]:
     counts = {"door": 0, "wall": 0}
     frames = list(recording)
     for frame in frames:
-        T = recorded.T_truth_world @ recorded.poses[frame.index]
-        p = se3.transform(T, frame.points)
+        p = se3.transform(recorded.T_truth_world @ recorded.poses[frame.index], frame.points)
         on_wall = (np.abs(p[:, 1] + room.WIDTH / 2) < 0.15) & (p[:, 2] < 2.0)
         for name, side in (("door", 1), ("wall", -1)):
             x = side * p[:, 0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,8 +34,6 @@ def plan(
     label: str,
     true: Sequence[Float64] = (),
     measured: Sequence[Float64] = (),
-    names: tuple[str, str] = ("x, m", "y, m"),
-    width: int = 380,
 ) -> str:
     """Draw a model from above as density of points (figures 5.4, 5.7, 5.8, 5.10).
 
@@ -49,7 +47,7 @@ def plan(
         True and measured closed outlines (K, 2).
     """
     extent = box[1] - box[0]
-    inner_width = width - 62.0
+    width, inner_width = 380, 318.0
     height = float(np.clip(inner_width * extent[1] / extent[0], 120, 1.15 * inner_width))
     figure, axes = drawing.make_figure(width, height + 62, _MARGINS)
     scale = max(extent[0] / inner_width, extent[1] / height)
@@ -68,19 +66,18 @@ def plan(
     # Few levels keep the file small.
     image[..., 3] = np.where(density > 0, 60 + 13 * np.round(15 * shade), 0).astype(np.uint8)
     axes.imshow(image, extent=(x0, x1, y0, y1), origin="lower", interpolation="none", aspect="auto")
-    for outline, color, style in (
-        *((o, drawing.BAD, "dashed") for o in true),
-        *((o, drawing.AFTER, "solid") for o in measured),
-    ):
-        closed = np.vstack([outline, outline[:1]])
-        axes.plot(closed[:, 0], closed[:, 1], color=color, linestyle=style, linewidth=1.5)
-    axes.plot(cameras[:, 0], cameras[:, 1], color=drawing.INK, linewidth=1)
-    axes.plot(cameras[:1, 0], cameras[:1, 1], "o", color=drawing.INK, markersize=4)
+    outlines = (true, drawing.BAD, "dashed"), (measured, drawing.AFTER, "solid")
+    for polygons, color, style in outlines:
+        for polygon in polygons:
+            closed = np.vstack([polygon, polygon[:1]])
+            axes.plot(*closed.T, color=color, linestyle=style, linewidth=1.5)
+    axes.plot(*cameras.T, color=drawing.INK, linewidth=1)
+    axes.plot(*cameras[0], "o", color=drawing.INK, markersize=4)
     axes.set_xlim(x0, x1)
     axes.set_ylim(y0, y1)
     for axis, size in ((axes.xaxis, inner_width), (axes.yaxis, height)):
         axis.set_major_locator(drawing.locator(size / 45))
-    _label(axes, names[0], f"{title} — {names[1]}")
+    _label(axes, "x, m", f"{title} — y, m")
     return drawing.svg(figure, label)
 
 
@@ -127,33 +124,26 @@ def cameras(before: Float64, after: Float64, truth: Float64) -> tuple[str, str]:
     before, after = before[has_pose], after[has_pose]
     projected = [plots.project(p[:, :3, 3], "above") for p in (before, after, truth)]
     box = plots.limits(*projected)
-    pictures = [
-        _cameras(poses, box, truth, color, f"Cameras {name} optimisation, from above")
-        for poses, color, name in (
-            (before, drawing.BEFORE, "before"),
-            (after, drawing.AFTER, "after"),
-        )
-    ]
-    return pictures[0], pictures[1]
+    return (
+        _cameras(before, box, truth, drawing.BEFORE, "before"),
+        _cameras(after, box, truth, drawing.AFTER, "after"),
+    )
 
 
-def _cameras(poses: Float64, box: Float64, truth: Float64, color: str, label: str) -> str:
+def _cameras(poses: Float64, box: Float64, truth: Float64, color: str, name: str) -> str:
     """Draw camera positions and viewing directions (n, 4, 4), and the true trajectory, in a box."""
     figure, axes = drawing.plan(box, "above", 380)
     size = 0.05 * float((box[1] - box[0]).max())
     path, centers = (plots.project(p[:, :3, 3], "above") for p in (truth, poses))
-    axes.plot(
-        path[:, 0], path[:, 1], color=drawing.REFERENCE, linewidth=1.4, linestyle=(0, (1, 1.2))
-    )
-    axes.plot(centers[:, 0], centers[:, 1], color=color, linewidth=1)
+    axes.plot(*path.T, color=drawing.REFERENCE, linewidth=1.4, linestyle=(0, (1, 1.2)))
+    axes.plot(*centers.T, color=color, linewidth=1)
     shape = size * np.array([[-0.5, 0, 1], [0, 0, 0], [0.5, 0, 1], [-0.5, 0, 1]])
     for k in range(0, len(poses), -(-len(poses) // 72)):
         scale, linewidth = (1.7, 1.8) if k == 0 else (1.0, 0.9)
         world = poses[k, :3, :3] @ (scale * shape.T) + poses[k, :3, 3:]
-        flat = plots.project(world.T, "above")
-        axes.plot(flat[:, 0], flat[:, 1], color=color, linewidth=linewidth)
-    axes.plot(centers[:1, 0], centers[:1, 1], "o", color=color, markersize=4)
-    return drawing.svg(figure, label)
+        axes.plot(*plots.project(world.T, "above").T, color=color, linewidth=linewidth)
+    axes.plot(*centers[0], "o", color=color, markersize=4)
+    return drawing.svg(figure, f"Cameras {name} optimisation, from above")
 
 
 def sweep(result: PeaksSweep) -> list[str]:
@@ -165,14 +155,8 @@ def sweep(result: PeaksSweep) -> list[str]:
         for which, color in ((0, drawing.BEFORE), (1, drawing.AFTER)):
             mean = factor * result.axes[:, which, k]
             deviation = factor * result.axes_std[:, which, k]
-            axes.fill_between(
-                result.sigmas,
-                np.maximum(mean - deviation, 0),
-                mean + deviation,
-                color=color,
-                alpha=0.18,
-                linewidth=0,
-            )
+            low, high = np.maximum(mean - deviation, 0), mean + deviation
+            axes.fill_between(result.sigmas, low, high, color=color, alpha=0.18, linewidth=0)
             axes.plot(result.sigmas, mean, color=color, linewidth=1.6, marker="o", markersize=3)
         axes.set_ylim(bottom=0)
         axes.locator_params(axis="y", nbins=5)
@@ -187,6 +171,7 @@ def example(run: PeaksRun, clouds: Sequence[Float64]) -> tuple[str, str]:
 
     `clouds` are the (N, 3) points of the views in their cameras' frames, m.
     """
+    style: Any = {"markersize": 4, "linewidth": 1}
     pictures = []
     estimates = (run.poses_sequential, run.poses_optimised)
     projected = [plots.project(p[:, :3, 3], "above") for p in (*estimates, run.truth)]
@@ -197,40 +182,16 @@ def example(run: PeaksRun, clouds: Sequence[Float64]) -> tuple[str, str]:
         )
         figure, axes = drawing.make_figure(400, 400 * 0.95, _MARGINS)
         sample = points[:: max(1, len(points) // 3000)]
-        axes.plot(
-            sample[:, 0],
-            sample[:, 2],
-            ".",
-            color=drawing.MUTED,
-            markersize=1.2,
-            alpha=0.5,
-            rasterized=True,
-        )
+        dots: Any = {"markersize": 1.2, "alpha": 0.5, "rasterized": True}
+        axes.plot(*sample[:, [0, 2]].T, ".", color=drawing.MUTED, **dots)
         if k == 1:
             for true, estimate in zip(projected[2], projected[1], strict=True):
-                ends = np.stack([true, estimate])
-                axes.plot(ends[:, 0], ends[:, 1], color=drawing.GRID, linewidth=1)
-            axes.plot(
-                projected[2][:, 0], projected[2][:, 1], "s", color=drawing.REFERENCE, markersize=4
-            )
-            axes.plot(
-                projected[1][:, 0],
-                projected[1][:, 1],
-                "o-",
-                color=drawing.AFTER,
-                markersize=4,
-                linewidth=1,
-            )
-        axes.plot(
-            projected[0][:, 0],
-            projected[0][:, 1],
-            "o-",
-            color=drawing.BEFORE,
-            markersize=4,
-            linewidth=1,
-        )
-        axes.set_xlim(box[0, 0], box[1, 0])
-        axes.set_ylim(box[0, 1], box[1, 1])
+                axes.plot(*np.stack([true, estimate], 1), color=drawing.GRID, linewidth=1)
+            axes.plot(*projected[2].T, "s", color=drawing.REFERENCE, markersize=4)
+            axes.plot(*projected[1].T, "o-", color=drawing.AFTER, **style)
+        axes.plot(*projected[0].T, "o-", color=drawing.BEFORE, **style)
+        axes.set_xlim(*box[:, 0])
+        axes.set_ylim(*box[:, 1])
         axes.set_aspect("equal", "box")
         _label(axes, "x, m", f"{name} optimisation — z, m")
         pictures.append(drawing.svg(figure, f"The synthetic case {name} optimisation, from above"))

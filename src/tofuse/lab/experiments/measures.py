@@ -85,8 +85,7 @@ def unwrapped_angle_deg(poses: Float64, axis: Float64) -> Float64:
 def straightness_m(positions: Float64) -> float:
     """RMS distance of positions (N, 3) from their best-fit line."""
     valid = positions[np.isfinite(positions[:, 0])]
-    centred = valid - valid.mean(0)
-    residual = np.linalg.svd(centred, compute_uv=False)[1:]
+    residual = np.linalg.svd(valid - valid.mean(0), compute_uv=False)[1:]
     return float(np.sqrt((residual**2).sum() / len(valid)))
 
 

@@ -181,10 +181,8 @@ def _run_json(run: Run) -> dict[str, Any]:
         "objective": run.objective,
         "seconds": round(run.seconds, 3),
     }
-    for name, score, model in (
-        ("before", run.score_before, run.model_before),
-        ("after", run.score_after, run.model_after),
-    ):
+    for name, estimate in (("before", run.before), ("after", run.after)):
+        score, model = estimate.score, estimate.model
         data[name] = {
             "ate_rms_m": score.ate_m,
             "rotation_rms_deg": score.rotation_deg,

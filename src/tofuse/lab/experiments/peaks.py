@@ -141,8 +141,7 @@ def refine_peaks(sigma: float, seed: int) -> tuple[PoseErrors, PoseErrors]:
     refiner = plane_refinement.Planes().start(ViewStore(Spacing()))
     poses: list[Float64] = []
     for view in views:
-        step = tracker.push(view)
-        T = step.T_component_camera
+        T = tracker.push(view).T_component_camera
         poses.append(poses[-1] if T is None else T)
         refiner.push(view, poses[-1])
     start = np.array(poses)

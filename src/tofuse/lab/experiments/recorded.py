@@ -99,5 +99,4 @@ def record_scene(
     planned = plan(scene, seed=seed, every=1, frames=limit, effects=effects or Effects())
     needed = np.any([planned.raw % stride == 0 for stride in strides], axis=0)
     planned = replace(planned, raw=planned.raw[needed])
-    frames = tuple(planned.corrected_frames(progress))
-    return RecordedScene(planned, frames, planned.poses)
+    return RecordedScene(planned, tuple(planned.corrected_frames(progress)), planned.poses)

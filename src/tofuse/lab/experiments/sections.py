@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +12,7 @@ from tofuse.apps.report import thumbnails
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
 from tofuse.lab.experiments import figures
-from tofuse.lab.experiments.cases import GUESSES, METHODS, CaseResult, Model, Run
+from tofuse.lab.experiments.cases import GUESSES, METHODS, CaseResult, Estimate, Model, Run
 from tofuse.lab.experiments.peaks import PeaksSweep
 from tofuse.lab.scenes import box, room
 from tofuse.lab.simulation import peaks
@@ -35,16 +35,16 @@ def case_section(result: CaseResult) -> dict[str, Any]:
     drifts = [
         Figure(
             figures.drift(
-                first.score_before.drift[:, k],
-                first.score_after.drift[:, k],
+                first.before.score.drift[:, k],
+                first.after.score.drift[:, k],
                 axis,
-                other_method=(other.score_before.drift[:, k], other.score_after.drift[:, k]),
+                other_method=(other.before.score.drift[:, k], other.after.score.drift[:, k]),
                 label=f"Error of the position in {axis}, {case.title}",
             )
         )
         for k, axis in enumerate("xyz")
     ]
-    before, after = figures.cameras(first.before, first.after, first.truth)
+    before, after = figures.cameras(first.before.poses, first.after.poses, first.truth)
     return {
         "name": case.scene,
         "title": case.title,
@@ -72,7 +72,7 @@ def case_section(result: CaseResult) -> dict[str, Any]:
 
 def _picture(frame: Any) -> str:
     if frame.amplitude_image is None:
-        image = thumbnails.depth_image(frame, thumbnails.depth_limits(frame), None)
+        image = thumbnails.depth_image(frame)
     else:
         image = thumbnails.grey(frame.amplitude_image)
     return thumbnails.data_uri(image, jpeg=True)
@@ -93,22 +93,10 @@ def _rows(result: CaseResult) -> list[dict[str, Any]]:
                         "guess": guess,
                         "draws": len(runs),
                         "posed": f"{_median(r.posed for r in runs):.0f} of {len(runs[0].truth)}",
-                        "ate": _pair(
-                            [100 * r.score_before.ate_m for r in runs],
-                            [100 * r.score_after.ate_m for r in runs],
-                        ),
-                        "rotation": _pair(
-                            [r.score_before.rotation_deg for r in runs],
-                            [r.score_after.rotation_deg for r in runs],
-                        ),
-                        "end": _pair(
-                            [100 * r.score_before.end_m for r in runs],
-                            [100 * r.score_after.end_m for r in runs],
-                        ),
-                        "model": _pair(
-                            [100 * r.model_before.sizes["surface_error_m"] for r in runs],
-                            [100 * r.model_after.sizes["surface_error_m"] for r in runs],
-                        ),
+                        "ate": _pair(runs, lambda e: 100 * e.score.ate_m),
+                        "rotation": _pair(runs, lambda e: e.score.rotation_deg),
+                        "end": _pair(runs, lambda e: 100 * e.score.end_m),
+                        "model": _pair(runs, lambda e: 100 * e.model.sizes["surface_error_m"]),
                         "loop": _count_true([r.loop[0] for r in runs]),
                         "verdict": _by_frequency([r.verdict for r in runs]),
                     }
@@ -120,8 +108,9 @@ def _median(values: Any) -> float:
     return float(np.median(list(values)))
 
 
-def _pair(before: Sequence[float], after: Sequence[float]) -> str:
-    return f"{_median(before):.1f} → {_median(after):.1f}"
+def _pair(runs: Sequence[Run], value: Callable[[Estimate], float]) -> str:
+    before, after = _median(value(r.before) for r in runs), _median(value(r.after) for r in runs)
+    return f"{before:.1f} → {after:.1f}"
 
 
 def _count_true(flags: Sequence[bool]) -> str:
@@ -165,8 +154,8 @@ def _sizes(result: CaseResult) -> list[list[str]]:
         cells = [true[name], result.perfect.sizes[name]]
         for method in METHODS:
             runs = result.select(method)
-            cells.append(_median(r.model_before.sizes[name] for r in runs))
-            cells.append(_median(r.model_after.sizes[name] for r in runs))
+            cells.append(_median(r.before.model.sizes[name] for r in runs))
+            cells.append(_median(r.after.model.sizes[name] for r in runs))
         rows.append([text, *(form.format(factor * float(c or 0)) for c in cells)])
     return rows
 
@@ -185,8 +174,8 @@ def _plans(
 
     truth = positions(previous_runs[METHODS[0]].truth)
     outlines = _outlines(result)
-    groups = [top_view(r.model_after) for r in previous_runs.values()]
-    groups += [top_view(r.model_before) for r in previous_runs.values()]
+    groups = [top_view(r.after.model) for r in previous_runs.values()]
+    groups += [top_view(r.before.model) for r in previous_runs.values()]
     # Cameras around an object are excluded from the limits, to show the object larger.
     visible = [] if previous_runs[METHODS[0]].case in ("torso", "box") else [truth]
     limits = figures.plan_limits(*groups, top_view(result.perfect), *outlines, *visible)
@@ -207,9 +196,9 @@ def _plans(
             {
                 "title": f"Method {method}",
                 "figures": [
-                    draw(a.model_before, positions(a.before), "identity guess", method),
-                    draw(b.model_before, positions(b.before), "previous guess", method),
-                    draw(b.model_after, positions(b.after), "optimised", method),
+                    draw(a.before.model, positions(a.before.poses), "identity guess", method),
+                    draw(b.before.model, positions(b.before.poses), "previous guess", method),
+                    draw(b.after.model, positions(b.after.poses), "optimised", method),
                 ],
             }
         )

@@ -15,13 +15,14 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.geometry import se3
 from tofuse.lab.experiments import measures
-from tofuse.lab.experiments.cases import CaseResult, Run
+from tofuse.lab.experiments.cases import CaseResult, Estimate, Run
 from tofuse.lab.experiments.peaks import PeaksSweep
 from tofuse.lab.scenes import box, rail, room, torso
 from tofuse.lab.simulation import peaks
 
 Outcome = Literal["agrees", "partly", "disagrees"]
 Judge = TypeVar("Judge", bound=Callable[..., "Finding"])
+T = TypeVar("T")
 
 _AGREES, _DISAGREES = 0.8, 0.2
 Y_DOWN = np.array([0.0, 1.0, 0.0])
@@ -101,13 +102,21 @@ def graded(grades: Iterable[float], numbers: str, unit: str = "draw") -> Finding
     elif mean <= _DISAGREES:
         outcome = "disagrees"
     if len(values) > 1:
-        true_count = sum(g == 1 for g in values)
-        numbers += f" Holds in {true_count} of {len(values)} {unit}s."
+        numbers += f" Holds in {sum(g == 1 for g in values)} of {len(values)} {unit}s."
     return Finding(outcome, numbers)
 
 
 def _fraction_true(*parts: bool) -> float:
     return float(np.mean(parts))
+
+
+def _both(runs: Sequence[Run], of: Callable[[Estimate], T]) -> tuple[list[T], list[T]]:
+    """Return a value of the runs' estimates before and after optimisation."""
+    return [of(r.before) for r in runs], [of(r.after) for r in runs]
+
+
+def _lowered(before: Iterable[float], after: Iterable[float]) -> list[bool]:
+    return [a < b for b, a in zip(before, after, strict=True)]
 
 
 def _median(values: Iterable[float]) -> float:
@@ -127,11 +136,11 @@ def _deg(values: Iterable[float]) -> str:
 
 def _legs(run: Run) -> tuple[Float64, Float64]:
     """End-to-end lengths in m of the outward and the return path: estimated, and true."""
-    has_pose = np.flatnonzero(np.isfinite(run.before[:, 0, 0]))
+    has_pose = np.flatnonzero(np.isfinite(run.before.poses[:, 0, 0]))
     turning_point = has_pose[np.linalg.norm(run.truth[has_pose, :3, 3], axis=1).argmax()]
     ends = [0, turning_point, has_pose[-1]]
     return (
-        np.linalg.norm(np.diff(run.before[ends, :3, 3], axis=0), axis=1),
+        np.linalg.norm(np.diff(run.before.poses[ends, :3, 3], axis=0), axis=1),
         np.linalg.norm(np.diff(run.truth[ends, :3, 3], axis=0), axis=1),
     )
 
@@ -161,7 +170,7 @@ def _slower_is_better(case: CaseResult, method: str) -> Finding:
     errors = []
     for run in case.select(method, "identity"):
         turn = int(np.linalg.norm(run.truth[:, :3, 3], axis=1).argmax())
-        step = run.score_before.step_m
+        step = run.before.score.step_m
         legs = [leg[np.isfinite(leg)] for leg in (step[: turn + 1], step[turn + 1 :])]
         if all(len(leg) for leg in legs):
             errors.append([float(leg.mean()) for leg in legs])
@@ -178,7 +187,7 @@ def _slower_is_better(case: CaseResult, method: str) -> Finding:
 @_states("rail-almost-returns", "5.1", "rail")
 def _almost_returns(case: CaseResult, method: str) -> Finding:
     """Previous guess: “the camera almost returns to the starting point.”"""
-    ends = [r.score_before.end_m for r in case.select(method)]
+    ends = [r.before.score.end_m for r in case.select(method)]
     path = 2 * rail.RAIL_LENGTH
     return graded(
         [1.0 if e < 0.1 * path else 0.5 if e < 0.2 * path else 0.0 for e in ends],
@@ -189,7 +198,7 @@ def _almost_returns(case: CaseResult, method: str) -> Finding:
 @_states("rail-mostly-y", "5.1", "rail")
 def _mostly_in_y(case: CaseResult, method: str) -> Finding:
     """“It has deteriorated from its actual path mostly in the y-direction.”"""
-    rms = np.array([r.score_before.axes_rms_m for r in case.select(method)])
+    rms, _ = _axes_rms(case.select(method))
     return graded(
         [_fraction_true(x < y, z < y) for x, y, z in rms],
         f"Error rms: x {_cm(rms[:, 0])}, y {_cm(rms[:, 1])}, z {_cm(rms[:, 2])}.",
@@ -197,7 +206,7 @@ def _mostly_in_y(case: CaseResult, method: str) -> Finding:
 
 
 @_states("rail-lowered", "5.1", "rail")
-def _lowered(case: CaseResult, method: str) -> Finding:
+def _lower_y_and_z(case: CaseResult, method: str) -> Finding:
     """“In the optimized case … the cumulative error of the cameras’ y and z-positions has been
     lowered.”
     """
@@ -209,10 +218,8 @@ def _lowered(case: CaseResult, method: str) -> Finding:
 
 
 def _axes_rms(runs: Sequence[Run]) -> tuple[Float64, Float64]:
-    return (
-        np.array([r.score_before.axes_rms_m for r in runs]),
-        np.array([r.score_after.axes_rms_m for r in runs]),
-    )
+    before, after = _both(runs, lambda e: e.score.axes_rms_m)
+    return np.array(before), np.array(after)
 
 
 def _before_after(before: Float64, after: Float64, columns: Sequence[int]) -> str:
@@ -223,13 +230,9 @@ def _before_after(before: Float64, after: Float64, columns: Sequence[int]) -> st
 @_states("rail-straighter", "5.1", "rail")
 def _straighter(case: CaseResult, method: str) -> Finding:
     """“They now follow a straighter path, as if the camera actually was moved along a rail.”"""
-    pairs = [
-        (measures.straightness_m(r.before[:, :3, 3]), measures.straightness_m(r.after[:, :3, 3]))
-        for r in case.select(method)
-    ]
-    before, after = zip(*pairs, strict=True)
+    before, after = _both(case.select(method), lambda e: measures.straightness_m(e.poses[:, :3, 3]))
     return graded(
-        [a < b for b, a in pairs],
+        _lowered(before, after),
         f"Distance from a straight line, rms: {_cm(before)} before, {_cm(after)} after.",
     )
 
@@ -261,7 +264,7 @@ def _fluctuates(case: CaseResult, method: str) -> Finding:
 @_states("room-keeps-shape", "5.2", "room")
 def _keeps_shape(case: CaseResult, method: str) -> Finding:
     """“The room roughly keeps its shape.”"""
-    sizes = [r.model_before.sizes for r in case.select(method)]
+    sizes = [r.before.model.sizes for r in case.select(method)]
     return graded(
         [_fraction_true(*_near_size(s)) for s in sizes],
         f"{_room_size(sizes)} before optimisation ({_room_size([case.perfect.sizes])} when the "
@@ -288,7 +291,7 @@ def _error_at_end(case: CaseResult, method: str) -> Finding:
     """“The accumulated error becomes visible at the end of the revolution.”"""
     pairs = []
     for run in case.select(method):
-        errors = measures.displacement_m(run.before, run.truth)
+        errors = measures.displacement_m(run.before.poses, run.truth)
         third = len(errors) // 3
         pairs.append(
             (np.nanmean(errors[third : 2 * third]), np.nanmean(errors[-max(1, third // 3) :]))
@@ -307,7 +310,7 @@ def _every_third(case: CaseResult, method: str) -> Finding:
     frame.”
     """
     errors = {
-        s: [r.model_before.sizes["surface_error_m"] for r in case.select(method, stride=s)]
+        s: [r.before.model.sizes["surface_error_m"] for r in case.select(method, stride=s)]
         for s in (2, 3, 4)
     }
     medians = {s: _median(v) for s, v in errors.items()}
@@ -339,7 +342,8 @@ def _door_gap(case: CaseResult, method: str) -> Finding:
 def _little_change(case: CaseResult, method: str) -> Finding:
     """“The reconstructed room did not change much after the optimization.”"""
     shifts = [
-        float(np.nanmedian(measures.displacement_m(r.before, r.after))) for r in case.select(method)
+        float(np.nanmedian(measures.displacement_m(r.before.poses, r.after.poses)))
+        for r in case.select(method)
     ]
     return graded(
         [m < 0.05 * room.LENGTH for m in shifts],
@@ -351,24 +355,21 @@ def _little_change(case: CaseResult, method: str) -> Finding:
 @_states("room-closer", "5.2", "room")
 def _closer_together(case: CaseResult, method: str) -> Finding:
     """“The cameras have been moved a little closer to each other in the optimized case.”"""
-    pairs = [(_scatter(r.before), _scatter(r.after)) for r in case.select(method)]
-    before, after = zip(*pairs, strict=True)
+    before, after = _both(case.select(method), lambda e: _scatter(e.poses)[0])
     return graded(
-        [a[0] < b[0] for b, a in pairs],
-        f"Cameras are {_cm(b[0] for b in before)} from their middle before and "
-        f"{_cm(a[0] for a in after)} after (rms; true: 0).",
+        _lowered(before, after),
+        f"Cameras are {_cm(before)} from their middle before and {_cm(after)} after (rms; true: "
+        "0).",
     )
 
 
 @_states("room-first-centred", "5.2", "room")
 def _first_in_middle(case: CaseResult, method: str) -> Finding:
     """“The first camera is now more to the center of the heap of cameras.”"""
-    pairs = [(_scatter(r.before), _scatter(r.after)) for r in case.select(method)]
-    before, after = zip(*pairs, strict=True)
+    before, after = _both(case.select(method), lambda e: _scatter(e.poses)[1])
     return graded(
-        [a[1] < b[1] for b, a in pairs],
-        f"The first camera is {_cm(b[1] for b in before)} from the middle before and "
-        f"{_cm(a[1] for a in after)} after.",
+        _lowered(before, after),
+        f"The first camera is {_cm(before)} from the middle before and {_cm(after)} after.",
     )
 
 
@@ -402,7 +403,8 @@ def _flat_walls(case: CaseResult, method: str) -> Finding:
     """“ICP has major problems when facing flat walls.”"""
     pairs = []
     for run in case.select(method):
-        errors = measures.displacement_m(measures.motions(run.before), measures.motions(run.truth))
+        found, true = measures.motions(run.before.poses), measures.motions(run.truth)
+        errors = measures.displacement_m(found, true)
         corner = _corner_steps(case, run)
         pairs.append((_rms(errors[~corner]), _rms(errors[corner])))
     wall, corner_error = zip(*pairs, strict=True)
@@ -422,7 +424,7 @@ def _picks_up(case: CaseResult, method: str) -> Finding:
     for run in case.select(method):
         corner = _corner_steps(case, run)
         turn, true = (
-            np.diff(measures.unwrapped_angle_deg(p, Y_DOWN)) for p in (run.before, run.truth)
+            np.diff(measures.unwrapped_angle_deg(p, Y_DOWN)) for p in (run.before.poses, run.truth)
         )
         pairs.append(
             (turn[~corner].sum() / true[~corner].sum(), turn[corner].sum() / true[corner].sum())
@@ -448,26 +450,22 @@ def _rms(values: Float64) -> float:
 @_states("empty-closes", "5.3", "empty-room")
 def _closes_loop(case: CaseResult, method: str) -> Finding:
     """“The optimization algorithm closes the loop …”"""
-    runs = case.select(method)
+    before, after = _both(case.select(method), lambda e: (e.score.end_m, e.score.end_deg))
     return graded(
         [
-            _fraction_true(
-                r.score_after.end_m < 0.25 * r.score_before.end_m,
-                r.score_after.end_deg < 0.25 * r.score_before.end_deg,
-            )
-            for r in runs
+            _fraction_true(*(a < 0.25 * b for b, a in zip(*ends, strict=True)))
+            for ends in zip(before, after, strict=True)
         ],
-        f"The last camera is off by {_cm(r.score_before.end_m for r in runs)} and "
-        f"{_deg(r.score_before.end_deg for r in runs)} before, "
-        f"{_cm(r.score_after.end_m for r in runs)} and "
-        f"{_deg(r.score_after.end_deg for r in runs)} after.",
+        f"The last camera is off by {_cm(m for m, _ in before)} and "
+        f"{_deg(deg for _, deg in before)} before, {_cm(m for m, _ in after)} and "
+        f"{_deg(deg for _, deg in after)} after.",
     )
 
 
 @_states("empty-shape", "5.3", "empty-room")
 def _no_proper_shape(case: CaseResult, method: str) -> Finding:
     """“… but it is not sufficient to give the room its proper shape.”"""
-    sizes = [r.model_after.sizes for r in case.select(method)]
+    sizes = [r.after.model.sizes for r in case.select(method)]
     return graded(
         [not all(_near_size(s)) for s in sizes],
         f"{_room_size(sizes)} instead of {room.LENGTH:.1f} x {room.WIDTH:.1f} m, and the model is "
@@ -479,11 +477,11 @@ def _no_proper_shape(case: CaseResult, method: str) -> Finding:
 def _objects_matter(furnished: CaseResult, empty: CaseResult, method: str) -> Finding:
     """“This shows the importance of having reference objects.”"""
     full, bare = (
-        [r.model_after.sizes["surface_error_m"] for r in case.select(method)]
+        [r.after.model.sizes["surface_error_m"] for r in case.select(method)]
         for case in (furnished, empty)
     )
     return graded(
-        [f < e for f, e in zip(full, bare, strict=True)],
+        _lowered(bare, full),
         f"Median distance of the optimised model from the true surface: {_cm(full)} with "
         f"chairs, {_cm(bare)} without.",
     )
@@ -496,7 +494,8 @@ def _overlap_deg(case: CaseResult, run: Run) -> tuple[float, float]:
     """Excess of the cameras' total rotation over the truth, before and after, degrees."""
     axis = case.T_truth_world[:3, :3].T @ np.array([0.0, 0.0, 1.0])
     end = [
-        float(measures.unwrapped_angle_deg(p, axis)[-1]) for p in (run.before, run.after, run.truth)
+        float(measures.unwrapped_angle_deg(p, axis)[-1])
+        for p in (run.before.poses, run.after.poses, run.truth)
     ]
     sign = np.sign(end[2]) or 1.0
     return float(sign * (end[0] - end[2])), float(sign * (end[1] - end[2]))
@@ -532,14 +531,10 @@ def _overlap_removed(case: CaseResult, method: str) -> Finding:
 def _pushed_out(case: CaseResult, method: str) -> Finding:
     """“The camera positions seem to have been pushed out, away from the torso.”"""
     runs = case.select(method)
-    pairs = [
-        (measures.circle_radius_m(r.before[:, :3, 3]), measures.circle_radius_m(r.after[:, :3, 3]))
-        for r in runs
-    ]
-    before, after = zip(*pairs, strict=True)
+    before, after = _both(runs, lambda e: measures.circle_radius_m(e.poses[:, :3, 3]))
     short = _median(_overlap_deg(case, r)[0] for r in runs) < 0
     return graded(
-        [a > b for b, a in pairs],
+        _lowered(after, before),
         f"Radius of the circle through the cameras: {_median(before):.2f} m before, "
         f"{_median(after):.2f} m after (true: {torso.DISTANCE:.2f} m)."
         + (" The chain falls short of a turn, and closing a gap pulls in." if short else ""),
@@ -549,9 +544,7 @@ def _pushed_out(case: CaseResult, method: str) -> Finding:
 @_states("torso-weight", "5.4", "torso")
 def _gained_weight(case: CaseResult, method: str) -> Finding:
     """“The model … looks like he has gained some weight.”"""
-    runs = case.select(method)
-    before = [r.model_before.sizes["girth_m"] for r in runs]
-    after = [r.model_after.sizes["girth_m"] for r in runs]
+    before, after = _both(case.select(method), lambda e: e.model.sizes["girth_m"])
     perfect = case.perfect.sizes["girth_m"]
     return graded(
         [_fraction_true(a > b, a > 1.02 * perfect) for b, a in zip(before, after, strict=True)],
@@ -568,11 +561,9 @@ def _angles_corrected(case: CaseResult, method: str) -> Finding:
     """“The viewing angles of the cameras seem to have been corrected for after the
     optimization.”
     """
-    runs = case.select(method)
-    before = [r.score_before.rotation_deg for r in runs]
-    after = [r.score_after.rotation_deg for r in runs]
+    before, after = _both(case.select(method), lambda e: e.score.rotation_deg)
     return graded(
-        [a < b for b, a in zip(before, after, strict=True)],
+        _lowered(before, after),
         f"Orientations are off by {_deg(before)} before and {_deg(after)} after (rms).",
     )
 
@@ -580,7 +571,7 @@ def _angles_corrected(case: CaseResult, method: str) -> Finding:
 @_states("box-right-angles", "5.5", "box")
 def _right_angles(case: CaseResult, method: str) -> Finding:
     """“The angles of the box are very close to accurate.”"""
-    worst = [r.model_after.sizes["worst_angle_deg"] for r in case.select(method)]
+    worst = [r.after.model.sizes["worst_angle_deg"] for r in case.select(method)]
     return graded(
         [1.0 if w < 2 else 0.5 if w < 5 else 0.0 for w in worst],
         f"The worst of the four angles is {_deg(worst)} from 90° "
@@ -591,7 +582,7 @@ def _right_angles(case: CaseResult, method: str) -> Finding:
 @_states("box-expanded", "5.5", "box")
 def _expanded(case: CaseResult, method: str) -> Finding:
     """“The box has expanded in every direction.”"""
-    sizes = [r.model_after.sizes for r in case.select(method)]
+    sizes = [r.after.model.sizes for r in case.select(method)]
     true = {"width_a_m": box.WIDTH, "width_b_m": box.DEPTH, "height_m": box.HEIGHT}
     return graded(
         [_fraction_true(*(s[name] > length for name, length in true.items())) for s in sizes],
@@ -610,10 +601,10 @@ def _white_middle(case: CaseResult, method: str) -> Finding:
     aiming at the box from the side.”
     """
     run = case.select(method)[0]
-    fit = run.model_after.box
+    fit = run.after.model.box
     if fit is None:
         return Finding("disagrees", "There is no model.")
-    distances = np.abs(run.model_after.points[:, :2] - fit.corners.mean(0)).max(1)
+    distances = np.abs(run.after.model.points[:, :2] - fit.corners.mean(0)).max(1)
     half = fit.widths_m.mean() / 2
     centre_density = (distances < 0.5 * half).sum() / (0.5 * half) ** 2
     wall_density = (
@@ -674,7 +665,7 @@ def _overall_reduced(sweep: PeaksSweep) -> Finding:
     before = [float(r.sequential.position.mean()) for r in runs]
     after = [float(r.optimised.position.mean()) for r in runs]
     return graded(
-        [a < b for b, a in zip(before, after, strict=True)],
+        _lowered(before, after),
         f"Mean error of the positions {_median(before):.2f} m before, {_median(after):.2f} m after "
         "(sigma 0.09).",
         "seed",
@@ -724,8 +715,7 @@ def _y_unaltered(sweep: PeaksSweep) -> Finding:
 @_states("peaks-x-z", "5.6", "peaks")
 def _x_z_similar(sweep: PeaksSweep) -> Finding:
     """“The x and z-positions are improved about the same.”"""
-    gain = _gain(sweep)
-    above = gain[sweep.sigmas > 0.05 + 1e-9].mean(0)
+    above = _gain(sweep)[sweep.sigmas > 0.05 + 1e-9].mean(0)
     ratio = above[0] / above[2] if above[2] > 0 else np.inf
     return graded(
         [1.0 if 2 / 3 < ratio < 1.5 else 0.5 if 0.5 < ratio < 2 else 0.0],
@@ -738,8 +728,7 @@ def _gain_grows_with_noise(sweep: PeaksSweep) -> Finding:
     """“For every parameter the optimization seem to do more good in case of more applied
     noise.”
     """
-    gain = _gain(sweep)
-    slopes = [float(np.polyfit(sweep.sigmas, g, 1)[0]) for g in gain.T]
+    slopes = [float(np.polyfit(sweep.sigmas, g, 1)[0]) for g in _gain(sweep).T]
     rising = sum(s > 0 for s in slopes)
     return graded(
         [_fraction_true(*(s > 0 for s in slopes))],
@@ -792,7 +781,7 @@ def _previous_is_better(*cases: CaseResult, method: str) -> Finding:
     for case in cases:
         runs = {g: case.select(method, g) for g in ("identity", "previous")}
         error = {
-            g: _median(r.model_before.sizes["surface_error_m"] for r in case_runs)
+            g: _median(r.before.model.sizes["surface_error_m"] for r in case_runs)
             for g, case_runs in runs.items()
         }
         posed = {g: _median(r.posed for r in case_runs) for g, case_runs in runs.items()}
@@ -824,7 +813,8 @@ def _worsened(*cases: CaseResult, method: str) -> Finding:
         for run in case.select(method):
             truth = measures.motions(run.truth)
             before, after = (
-                measures.displacement_m(measures.motions(p), truth) for p in (run.before, run.after)
+                measures.displacement_m(measures.motions(e.poses), truth)
+                for e in (run.before, run.after)
             )
             better_half = before <= np.nanmedian(before)
             fractions.append(float(np.mean(after[better_half] > before[better_half])))
