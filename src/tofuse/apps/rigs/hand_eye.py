@@ -214,8 +214,7 @@ class _Fit:
             T_b, _ = self.b.at(times - offset)
             return np.asarray(se3.log(se3.inverse(T_a @ X) @ Y @ T_b) / projective.UNITS)
 
-        steps = np.diag(self.steps)[free]
-        both = [residuals(step) - residuals(-step) for step in steps]
+        both = [residuals(step) - residuals(-step) for step in np.diag(self.steps)[free]]
         J = np.stack(both, axis=2) / (2 * self.steps[free])
         return J, residuals(np.zeros(13)), times
 
@@ -312,8 +311,7 @@ def _spurious_information(w: Float64, sigma: Float64) -> Float64:
 
 def _weighted_product(J: Float64, w: Float64, K: Float64) -> Float64:
     """Return the sum of J^T w K over all residuals."""
-    out = np.tensordot(J * w[..., None], K, ((0, 1), (0, 1)))
-    return np.asarray(out, np.float64)
+    return np.asarray(np.tensordot(J * w[..., None], K, ((0, 1), (0, 1))), np.float64)
 
 
 def _correlation_time(e: Float64, times: Float64, unknowns: float) -> float:

@@ -143,8 +143,7 @@ def distances_between(
     target: SampledView, source: SampledView, T_target_source: Float64
 ) -> Float64:
     """Return the (N,) distances in m between the surfaces visible in both views."""
-    limit_m = _MAX_DISTANCE * target.depth
-    return np.abs(_residuals(target, source, T_target_source, limit_m).r)
+    return np.abs(_residuals(target, source, T_target_source, _MAX_DISTANCE * target.depth).r)
 
 
 def _grouped(parts: Iterable[tuple[K, Float64]]) -> dict[K, Float64]:
@@ -249,8 +248,7 @@ class _System:
 
     def compare(self) -> list[_Residuals]:
         """Return the residuals of each pair, and update the noise scales of the cameras."""
-        none = _Residuals(*np.zeros((7, 0)))
-        rows = [none] * len(self.pairs)
+        rows = [_Residuals(*np.zeros((7, 0)))] * len(self.pairs)
         inverse = se3.inverse(self.poses)
 
         def work(first: int, last: int) -> None:
@@ -393,8 +391,7 @@ class _System:
 
     def disagreement(self, rows: Sequence[_Residuals]) -> SurfaceDistances:
         """See `disagreements`."""
-        distances = [np.abs(row.r) for row in rows]
-        return _medians(zip(self.ends, distances, strict=True))
+        return _medians(zip(self.ends, [np.abs(row.r) for row in rows], strict=True))
 
 
 def _weighted(J: Float64, w: Float64) -> Float64:

@@ -184,8 +184,7 @@ def _common_world(
 def _views(camera: Camera, track: Track, count: int) -> Iterator[tuple[int, PreparedView]]:
     """Yield some views along a track, with the rows of their poses."""
     for p in evenly_spaced(np.arange(len(track.times)), count):
-        row = int(np.searchsorted(camera.recording.timestamps, track.times[p]))
-        frame = camera.image(row)
+        frame = camera.image(int(np.searchsorted(camera.recording.timestamps, track.times[p])))
         if frame is not None:
             yield p, camera.surface(frame)
 

@@ -70,8 +70,7 @@ def track_rig(cameras: Sequence[Camera], recording: Recording, progress: Progres
     InputError
         If no camera has a trajectory.
     """
-    source = recording.source
-    assert isinstance(source, RigSource)
+    source = RigSource.of(recording)
     _, first, instant = np.unique(
         source.instant[recording.indices], return_index=True, return_inverse=True
     )
@@ -144,8 +143,7 @@ def _rig_estimates(
         A = se3.adjoint(stated.T_rig_camera)
         by_pose = np.linalg.inv(A @ np.stack(covariances) @ A.T)
         T, valid = track.at(times)
-        T_world_rig = T @ se3.inverse(stated.T_rig_camera)
-        poses.append(np.where(valid[:, None, None], T_world_rig, np.nan))
+        poses.append(np.where(valid[:, None, None], T @ se3.inverse(stated.T_rig_camera), np.nan))
         information.append(by_pose[nearest(track.times, times)])
     if not poses:
         raise InputError("no camera has a trajectory", where="the rig")
@@ -174,8 +172,7 @@ def refined(
 
     They stay unchanged if the support of the views would fall. `instant` (F,) is by frame.
     """
-    source = recording.source
-    assert isinstance(source, RigSource)
+    source = RigSource.of(recording)
     selected = _spaced_instants(cameras, recording, poses, instant)
     views, frames = [], []
     for frame in np.flatnonzero(np.isin(instant, selected)):

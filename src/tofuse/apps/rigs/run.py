@@ -89,8 +89,7 @@ def run_rig(
         rig = read_rig(rig_file)
         rig.check_count(len(inputs), rig_file)
         cameras = open_cameras(inputs, options.format, [camera.name for camera in rig.cameras])
-        recordings = [camera.recording for camera in cameras]
-        source = RigSource(rig, recordings)
+        source = RigSource(rig, [camera.recording for camera in cameras])
         full_recording = Recording.of(source, " ".join(map(str, opening.paths)), "rig")
         recording = _selected(full_recording, source, options)
         config = resolve(options)
@@ -104,7 +103,7 @@ def run_rig(
                 recording, result.result, config, options.threads, progress
             )
             progress.stage("writing")
-            _write(result, recording, folder, texture, share=options.share)
+            _write(result, folder, texture, share=options.share)
     return result
 
 
@@ -141,8 +140,7 @@ def reconstruct_rig(
         As in `reconstruct`.
     """
     progress = progress or Silent()
-    source = recording.source
-    assert isinstance(source, RigSource)
+    source = RigSource.of(recording)
     rig = source.rig
     instants, first = np.unique(source.instant[recording.indices], return_index=True)
     displaced: list[CameraMotion] = []
@@ -151,8 +149,7 @@ def reconstruct_rig(
     else:
         poses = np.tile(np.eye(4), (len(instants), 1, 1))
         displaced, distances = _check_calibration(cameras, recording)
-        T_rig_frame = source.T_rig_camera[recording.indices]
-        trajectory = RigTrajectory(poses, T_rig_frame, distances, ())
+        trajectory = RigTrajectory(poses, source.T_rig_camera[recording.indices], distances, ())
     instant = np.searchsorted(instants, source.instant[recording.indices])
     frame_poses = trajectory.poses[instant] @ trajectory.T_rig_frame
     is_moving = bool(trajectory.measured or trajectory.tracked)
@@ -191,8 +188,7 @@ def _calibration_edges(
     Calibration errors are the same at all instants: if the rig is static (`follow`), later frames
     are tied to the first frame of their camera.
     """
-    source = recording.source
-    assert isinstance(source, RigSource)
+    source = RigSource.of(recording)
     # The bound on the errors is enlarged for systematic ones, which these covariances include.
     covariances = [
         c.covariance / pose_accuracy.COVARIANCE_FACTOR + np.diag(_MIN_VARIANCES)
@@ -276,8 +272,7 @@ def _check_calibration(
 
     Also the distances between the surfaces of each pair at the calibrated poses, see `JointPoses`.
     """
-    source = recording.source
-    assert isinstance(source, RigSource)
+    source = RigSource.of(recording)
     first = np.flatnonzero(source.instant == source.instant[recording.indices[0]])
     views = []
     for index in first:
@@ -300,7 +295,6 @@ def _check_calibration(
 
 def _write(
     rig_result: RigResult,
-    recording: Recording,
     folder: folders.OutputFolder,
     texture: Textured | None,
     *,
@@ -309,9 +303,7 @@ def _write(
     from tofuse.apps.report import ReportExtras, write_report
 
     def report(result: Reconstruction, target: Path) -> None:
-        source = recording.source
-        assert isinstance(source, RigSource)
-        cameras = ", ".join(camera.name for camera in source.rig.cameras)
+        cameras = ", ".join(camera.name for camera in rig_result.rig.cameras)
         is_main = result is rig_result.result
         extras = ReportExtras(
             f"rig of {cameras}",

@@ -192,8 +192,7 @@ def _costs_of_lags(
     `poses` are those of the preceding cameras and of this one.
     """
     stamps = camera.recording.timestamps + offset
-    shifts = np.arange(-_MAX_LAG, _MAX_LAG + 1)
-    rows = nearest(stamps, times)[:, None] + shifts
+    rows = nearest(stamps, times)[:, None] + np.arange(-_MAX_LAG, _MAX_LAG + 1)
     inside = (rows >= 0) & (rows < len(stamps))
     views: dict[int, SampledView | None] = {}
     for row in np.unique(rows[inside]).tolist():

@@ -63,6 +63,12 @@ class RigSource:
         }
         self.metadata["cameras"] = [camera.name for camera in rig.cameras]
 
+    @staticmethod
+    def of(recording: Recording) -> RigSource:
+        """Return the source of a rig's recording."""
+        assert isinstance(recording.source, RigSource)
+        return recording.source
+
     @property
     def warnings(self) -> list[str]:
         """See `Source.warnings`."""
