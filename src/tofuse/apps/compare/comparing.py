@@ -32,6 +32,7 @@ from tofuse.formats.geometry import surface_points
 from tofuse.formats.recordings import SingleView
 
 Verdict = Literal["pass", "fail", "undecided", "not seen"]
+_VERDICTS = "undecided", "pass", "fail"  # of a place, by its number: 0, 1, -1
 WORST = 5  # places that are listed of each region
 _MAX_POINTS = 100_000  # that are registered
 # A reference is symmetric if this fraction of it, moved, lies within this fraction of its diagonal.
@@ -155,7 +156,7 @@ class Comparison:
                     "uneven_m": float(places.uneven[i]),
                     "slope_m": float(places.slope[i]),
                     "points": int(places.points[i]),
-                    "verdict": _word(int(verdicts[i])) if self.tolerance_m else "",
+                    "verdict": _VERDICTS[verdicts[i]] if self.tolerance_m else "",
                 }
                 for i in of[order][:WORST].tolist()
             ]
@@ -260,11 +261,6 @@ def _verdicts(places: Places, tolerance_m: float | None, *, decided: bool) -> In
     if tolerance_m is None or not decided:
         return np.zeros(len(places.deviation), np.intp)
     return places.verdicts(tolerance_m)
-
-
-def _word(verdict: int) -> Verdict:
-    words: tuple[Verdict, ...] = ("undecided", "pass", "fail")
-    return words[verdict]
 
 
 def millimetres(metres: float) -> str:
@@ -385,11 +381,40 @@ def _registered(
     surface = reference.surface
     target = surface_points(GeometryRecord(surface.points, surface.faces), surface.name)
     target = target[scene.random_subset(len(target), _MAX_POINTS)]
+    found, rival = _best_registration(measured, reference, points, target, guess)
+    T = found.T_target_source
+    names = []
+    if rival is not None and (found.given_guess or not found.believed):
+        motion = rival @ se3.inverse(T)
+        if _is_symmetry(reference, motion):
+            names.append(f"{_motion_words(motion)} it fits as well")
+        elif found.given_guess and guess is not None:
+            names.append("another pose fits nearly as well")
+        elif found.given_guess:
+            reason, remedy = "another pose fits as well", "a guess near this one"
+            found = replace(found, believed=False, reason=reason, remedy=remedy)
+    if _slides(reference, T, found.unobservable):
+        frames = [
+            SingleView(n, n, "", 0, CloudFrame.of(p)) for n, p in (("", points), ("", target))
+        ]
+        pair = PairResult(frames[0], frames[1], found)
+        names.append(f"{pair_words.unobservable(pair)} is not determined")
+    start = "this pose" if guess is None else "the guess"
+    given = f"given {start}: {'; '.join(names)}" if names else ""
+    if found.believed or given:
+        return found, given, ""
+    return found, "", f"the registration is not accepted: {pair_words.doubt(found)}"
+
+
+def _best_registration(
+    measured: Surface, reference: Reference, points: Float64, target: Float64, guess: Float64 | None
+) -> tuple[Registration, Float64 | None]:
+    """Return the registration of points to those of the target, and a pose that may fit as well."""
     try:
         found = register(points, target, guess=guess)
     except RegistrationError as error:
         raise InputError(
-            f"can't be registered to {surface.name} ({error})",
+            f"can't be registered to {reference.surface.name} ({error})",
             where=measured.name,
             remedy="check the units (--unit), or pass --guess",
         ) from error
@@ -411,29 +436,8 @@ def _registered(
         # Whoever states where the part lies excludes poses elsewhere.
         alone = register(points, target, guess=T, method=AnyPair(search=False))
         if alone.believed:
-            found, T = alone, alone.T_target_source
-    names = []
-    if rival is not None and (found.given_guess or not found.believed):
-        motion = rival @ se3.inverse(T)
-        if _is_symmetry(reference, motion):
-            names.append(f"{_motion_words(motion)} it fits as well")
-        elif found.given_guess and guess is not None:
-            names.append("another pose fits nearly as well")
-        elif found.given_guess:
-            reason, remedy = "another pose fits as well", "a guess near this one"
-            found = replace(found, believed=False, reason=reason, remedy=remedy)
-    slides = _slides(reference, T, found.unobservable)
-    if slides:
-        frames = [
-            SingleView(n, n, "", 0, CloudFrame.of(p)) for n, p in (("", points), ("", target))
-        ]
-        pair = PairResult(frames[0], frames[1], found)
-        names.append(f"{pair_words.unobservable(pair)} is not determined")
-    start = "this pose" if guess is None else "the guess"
-    given = f"given {start}: {'; '.join(names)}" if names else ""
-    if found.believed or given:
-        return found, given, ""
-    return found, "", f"the registration is not accepted: {pair_words.doubt(found)}"
+            found = alone
+    return found, rival
 
 
 def _distance(points: Float64, T: Float64, T_other: Float64) -> float:

@@ -386,8 +386,7 @@ def _noise(feet: Float64, deviation: Float64, stated: Float64 | None, rows: Intp
 
 def _neighbour_sigma(feet: Float64, deviation: Float64) -> float:
     neighbour = KdTree(feet).neighbours(feet[:: max(1, len(feet) // 5000)], 4)[0]
-    difference = deviation[neighbour[:, 3]] - deviation[neighbour[:, 0]]
-    return robust_sigma(difference) / 2**0.5
+    return robust_sigma(deviation[neighbour[:, 3]] - deviation[neighbour[:, 0]]) / 2**0.5
 
 
 def _point_noise(
@@ -447,8 +446,7 @@ def _grouped(feet: Float64, region: Intp, size: float) -> tuple[Intp, int]:
     large = count >= max(FEWEST, 0.4 * float(np.median(count[count >= min(FEWEST, count.max())])))
     if not large.any():
         return np.full(len(feet), -1, np.intp), 0
-    sums = _Sums(label, len(count))
-    centres = sums.mean3(feet)[large]
+    centres = _Sums(label, len(count)).mean3(feet)[large]
     owner = np.zeros(len(count), np.intp)
     owner[label] = region
     made = _nearest_centre(feet, region, centres, owner[large], _MAX_REMOTE * size)
@@ -470,8 +468,7 @@ def _apart(points: Float64, region: Intp, distance: float) -> Float64:
 
 
 def _assigned(feet: Float64, region: Intp, places: Places) -> Intp:
-    limit = _MAX_REMOTE * places.size
-    return _nearest_centre(feet, region, places.centres, places.region, limit)
+    return _nearest_centre(feet, region, places.centres, places.region, _MAX_REMOTE * places.size)
 
 
 def _covariance(

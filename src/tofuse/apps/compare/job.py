@@ -85,8 +85,7 @@ def compare_exit_status(comparison: Comparison) -> int:
 def write_comparison(comparison: Comparison, folder: Path) -> None:
     """Write the files of a comparison."""
     found = comparison.deviations
-    rows = comparison.worst
-    atomic.write_text(folder / "deviations.csv", _table(rows))
+    atomic.write_text(folder / "deviations.csv", _table(comparison.worst))
     faces = comparison.measured.faces
     whole = faces is not None and len(found.points) == len(comparison.measured.points)
     kept = np.ones(len(found.points), bool) if whole else np.isfinite(found.deviation)

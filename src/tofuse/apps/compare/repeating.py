@@ -185,8 +185,7 @@ def repeated(sessions: Sequence[Session], *, searched: bool = True) -> Repetitio
     first = sessions[0].surface
     reference = Reference.of(first)
     reach = Reach.of(reference, spacing_of(first.points))
-    own = mapped(measured_points(first, reference), reference, np.eye(4), reach)
-    places = own.places
+    places = mapped(measured_points(first, reference), reference, np.eye(4), reach).places
     poses, deviation, sigma, seen = [], [], [], []
     for k, session in enumerate(sessions):
         T = np.eye(4)

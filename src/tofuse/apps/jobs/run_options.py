@@ -28,6 +28,7 @@ from tofuse.formats.files import reading
 from tofuse.formats.recordings import OpeningOptions
 
 _SAMPLED = 8  # frames that are checked for the input of --unwrap
+_BACKGROUND_FILTERS = {"background", "foreground", "mask", "box"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +123,8 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
         method, kind, where="--method" if options.method else f"{options.config}: method"
     )
     config = changed(config, {**changes, "method": method}, where=str(options.config or "--config"))
-    for name, value in (("guess", options.guess), ("moving", options.moving)):
+    for name in ("guess", "moving"):
+        value = getattr(options, name)
         if value and not hasattr(config.odometry, name):
             raise InputError(
                 f"does not apply to the odometry {name_of(config.odometry)!r}",
@@ -141,34 +143,38 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
                 remedy="allow more, e.g. --memory 2GB",
             )
         config = changed(config, {"memory_mb": megabytes}, where="--memory")
-    leading_filters: list[dict[str, Any]] = []
-    if options.min_depth is not None or options.max_depth is not None:
-        low = options.min_depth or 0.0
-        if options.max_depth is not None and options.max_depth <= low:
-            raise InputError(
-                f"is {options.max_depth} m and the minimum depth {low} m",
-                where="--max-depth",
-                remedy="use a larger one",
-            )
-        leading_filters.append({"part": "distance", "minimum": low, "maximum": options.max_depth})
     current = config.to_dict()
-    filters = {item["part"] for item in current["filters"]}
-    corrections = list(current["corrections"])
+    filters, corrections = _depth_limits(options), list(current["corrections"])
+    names = [item["part"] for item in corrections]
     if options.object:
-        if options.max_depth is None and not filters & {"background", "foreground", "mask", "box"}:
-            leading_filters.append({"part": "background"})
+        cuts = {item["part"] for item in current["filters"]} & _BACKGROUND_FILTERS
+        if options.max_depth is None and not cuts:
+            filters.append({"part": "background"})
         # Scattered light of the background is fixed to the image, and drags the object along.
-        names = [item["part"] for item in corrections]
         if "multipath" in names and "scattering" not in names:
             corrections.insert(names.index("multipath"), {"part": "scattering"})
         # Neither gravity nor the camera's odometry applies to the coordinate frame of the object.
         config = changed(config, {"priors": []}, where="--object")
-    if options.unwrap and kind == "range" and "unwrap" not in [c["part"] for c in corrections]:
+    if options.unwrap and kind == "range" and "unwrap" not in names:
         corrections.insert(0, {"part": "unwrap"})
-    if leading_filters or corrections != current["corrections"]:
-        lists = {"filters": [*leading_filters, *current["filters"]], "corrections": corrections}
+    if filters or corrections != current["corrections"]:
+        lists = {"filters": [*filters, *current["filters"]], "corrections": corrections}
         config = changed(config, lists, where="--object" if options.object else "--max-depth")
     return config
+
+
+def _depth_limits(options: Options) -> list[dict[str, Any]]:
+    """Return the filter that the limits of depth specify, if there are any."""
+    low, high = options.min_depth, options.max_depth
+    if high is not None and high <= (low or 0.0):
+        raise InputError(
+            f"is {high} m and the minimum depth {low or 0.0} m",
+            where="--max-depth",
+            remedy="use a larger one",
+        )
+    if low is None and high is None:
+        return []
+    return [{"part": "distance", "minimum": low or 0.0, "maximum": high}]
 
 
 def check_unwrap(recording: Recording) -> None:
