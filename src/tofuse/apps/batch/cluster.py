@@ -36,8 +36,7 @@ class DaskWorkers(Workers):
 
     def start(self, task: Task) -> Future[Record]:
         """See `Workers`."""
-        key = f"{task.job.name}-{uuid4().hex}"
-        remote = self._client.submit(work, task, key=key, pure=False)
+        remote = self._client.submit(work, task, key=f"{task.job.name}-{uuid4().hex}", pure=False)
         future: Future[Record] = Future()
         remote.add_done_callback(lambda done: self._transfer(done, future))
         return future
@@ -73,7 +72,7 @@ class DaskWorkers(Workers):
             error = remote.exception()
             if isinstance(error, KilledWorker):
                 future.set_result(Record("", "killed", reason="its workers were killed"))
-            elif _cannot_deserialize(error):
+            elif isinstance(error, ImportError | AttributeError) or "deserializ" in str(error):
                 future.set_exception(
                     InputError(
                         f"can't load the jobs of this version ({str(error).partition(chr(10))[0]})",
@@ -115,8 +114,3 @@ def _connect(address: str) -> Any:
             where=address,
             remedy="start one with `dask scheduler`, and pass the address that it prints",
         ) from error
-
-
-def _cannot_deserialize(error: BaseException) -> bool:
-    """Whether a scheduler or worker could not load the objects of a task."""
-    return isinstance(error, ImportError | AttributeError) or "deserializ" in str(error)

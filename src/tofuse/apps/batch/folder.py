@@ -138,8 +138,7 @@ class BatchFolder:
     def record(self, job: Job) -> Record | None:
         """Return the record of a job; None if there is none, or it is damaged."""
         try:
-            data = json.loads(self._record(job).read_text(encoding="utf-8"))
-            return _record_of(data)
+            return _record_of(json.loads(self._record(job).read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError):
             return None
 

@@ -196,7 +196,9 @@ def _matches(row: _Row, base: Path) -> list[str]:
     if not has_magic(pattern) or os.path.exists(path):
         return [str(Path(path))]
     matches = glob(os.path.join(escape(str(base)), pattern), recursive=True)
-    paths = sorted(map(Path, matches), key=_path_order)
+    paths = sorted(
+        map(Path, matches), key=lambda path: [reading.name_order(Path(part)) for part in path.parts]
+    )
     if not paths:
         raise InputError(
             f"nothing matches {row.pattern}",
@@ -204,10 +206,6 @@ def _matches(row: _Row, base: Path) -> list[str]:
             remedy=f"check the pattern; relative ones refer to {base}",
         )
     return [str(p) for p in paths]
-
-
-def _path_order(path: Path) -> list[list[tuple[int, int, str]]]:
-    return [reading.name_order(Path(part)) for part in path.parts]
 
 
 def _check_name(name: str, taken: Iterable[str], where: str) -> str:
@@ -228,8 +226,7 @@ def _unique_name(recording: str, taken: Iterable[str]) -> str:
 
     Recordings that are appended to a list don't change earlier names.
     """
-    path = Path(recording)
-    parts = [_safe(part) for part in path.parts[1:]] or ["recording"]
+    parts = [_safe(part) for part in Path(recording).parts[1:]] or ["recording"]
     first = len(parts) - 1
     if parts[first] == "recording" and first:  # the name that `tofuse demo` uses
         parts[first - 1 :] = [parts[first - 1]]

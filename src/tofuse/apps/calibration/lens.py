@@ -308,8 +308,7 @@ def _fit_lens(
 def _initial_fit(views: Sequence[BoardView], board: Board, size: tuple[int, int]) -> _Fit:
     """Return a fit with one radial coefficient, from which all models converge."""
     corners = [view.corners.astype(np.float32) for view in views]
-    points = [board.points] * len(views)
-    K = cv2.initCameraMatrix2D(points, corners, size)
+    K = cv2.initCameraMatrix2D([board.points] * len(views), corners, size)
     camera = Pinhole(*size, *(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
     poses = [board_pose(camera, view.corners, board) for view in views]
     if any(pose is None for pose in poses):

@@ -185,7 +185,6 @@ def _thinned(
     points, normals = points[known], normals[known]
     cells = np.floor(points / (_SPACING * reach)).astype(np.int64)
     # Both sides of a thin wall are kept.
-    keys = np.column_stack([cells, normals > 0])
-    _, kept = np.unique(keys, axis=0, return_index=True)
+    _, kept = np.unique(np.column_stack([cells, normals > 0]), axis=0, return_index=True)
     kept = kept[:: -(-len(kept) // _MAX_POINTS)]
     return points[kept].astype(np.float32), normals[kept].astype(np.float32)

@@ -96,8 +96,7 @@ def _lens(arguments: Calibrate) -> Summary:
     if len(fit.left_out) > _MAX_LISTED:
         lines.append(f"left out: {len(fit.left_out) - _MAX_LISTED} more frames (--json lists all)")
     if arguments.out is not None:
-        metadata = recording_fields(recording)
-        write_camera_json(arguments.out, fit.camera, metadata)
+        write_camera_json(arguments.out, fit.camera, recording_fields(recording))
         lines.append(f"written to {arguments.out}")
     return fit.to_dict(), lines, list(fit.warnings)
 

@@ -86,8 +86,7 @@ def card(arguments: cli.Card) -> int:
     from tofuse.apps.card import card_files
     from tofuse.apps.results import folders
 
-    options = from_arguments(folders.OutputOptions, arguments)
-    found = card_files(arguments.results, options)
+    found = card_files(arguments.results, from_arguments(folders.OutputOptions, arguments))
     table = Table("quantity", "mean", "scatter", "over the time", "p", "", box=None)
     for row in found.rows:
         table.add_row(*row)

@@ -97,8 +97,7 @@ class TerminalProgress(Silent):
     def notify(self, event: Any) -> None:
         """Show that a kernel is being compiled; called by Numba when it begins and ends."""
         for task in self._bar.tasks[-1:]:
-            health = "compiling kernels" if event.is_start else ""
-            self._bar.update(task.id, health=health)
+            self._bar.update(task.id, health="compiling kernels" if event.is_start else "")
 
     def stage(self, name: str, total: int | None = None) -> None:
         """Begin a stage."""

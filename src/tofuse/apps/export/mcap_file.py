@@ -77,7 +77,9 @@ class _Messages:
             schema = json.dumps({"title": name, **_schema_of(message)}).encode()
             number = self._writer.register_schema(name, "jsonschema", schema)
             self._channels[topic] = self._writer.register_channel(topic, "json", number)
-        data = json.dumps(message, allow_nan=False, default=_base64).encode()
+        data = json.dumps(
+            message, allow_nan=False, default=lambda data: base64.b64encode(data).decode()
+        ).encode()
         self._writer.add_message(self._channels[topic], nanoseconds, data, nanoseconds)
 
     def transform(self, time: float, parent: str, child: str, T: Float64) -> None:
@@ -96,8 +98,7 @@ class _Messages:
 def _write_model(messages: _Messages, scene: Scene) -> None:
     start = float(scene.times[0])
     messages.transform(start, MAP, WORLD, scene.T_zup_world)
-    poses = [_pose(T) for T in scene.poses]
-    messages.write("/trajectory", start, frame_id=WORLD, poses=poses)
+    messages.write("/trajectory", start, frame_id=WORLD, poses=[_pose(T) for T in scene.poses])
     points = _points(scene.cloud)
     fields = [
         {
@@ -178,10 +179,6 @@ def _pose(T: Float64) -> dict[str, dict[str, float]]:
         "position": dict(zip("xyz", T[:3, 3].tolist(), strict=True)),
         "orientation": dict(zip("xyzw", rotation, strict=True)),
     }
-
-
-def _base64(data: bytes) -> str:
-    return base64.b64encode(data).decode()
 
 
 def _schema_of(value: Any) -> dict[str, Any]:

@@ -65,8 +65,7 @@ class OccupancyGrid:
                 where="--voxel",
                 remedy=f"pass at least {larger:.2g}m",
             )
-        zeros = np.zeros(shape, np.int32)
-        return cls(first, voxel_m, np.zeros(shape, np.float32), zeros)
+        return cls(first, voxel_m, np.zeros(shape, np.float32), np.zeros(shape, np.int32))
 
     @property
     def origin(self) -> Float64:

@@ -63,8 +63,7 @@ def _log_model(rr: Any, recording: Any, scene: Scene) -> None:
     cloud, mesh = scene.cloud, scene.mesh
     recording.log("world/cloud", rr.Points3D(cloud.points, colors=cloud.color), static=True)
     if (sigma := cloud.scalars.get("sigma")) is not None:
-        points = rr.Points3D(cloud.points, colors=_colors(sigma))
-        recording.log("world/sigma", points, static=True)
+        recording.log("world/sigma", rr.Points3D(cloud.points, colors=_colors(sigma)), static=True)
     if mesh is not None:
         surface = rr.Mesh3D(
             vertex_positions=mesh.points,

@@ -94,8 +94,7 @@ class Region:
 
 def regions_of(view: PreparedView, frame: int) -> list[Region]:
     """Return the smooth regions of a view, without edges and creases, for frame number `frame`."""
-    planes = view.planes
-    w = planes[..., 3]
+    w = view.planes[..., 3]
     is_valid = (w > 0) & (view.z > 0) & (view.sigma > 0) & np.isfinite(view.sigma)
     is_valid &= np.isfinite(view.normals).all(-1) & np.isfinite(view.rays).all(-1)
     labels = _labels(view, is_valid)

@@ -156,8 +156,7 @@ def merge_sessions(
             odometry = session.config.odometry
             assert isinstance(odometry, given.GivenPoses)
             stated = {k + offset: pose for k, pose in session.stated.items()}
-            with_poses = given.StatedPoses(stated, odometry)
-            mapper.interrupt(replace(session.config, odometry=with_poses))
+            mapper.interrupt(replace(session.config, odometry=given.StatedPoses(stated, odometry)))
             session_recording = replace(recording, indices=session.recording.indices + offset)
             reconstructing.push_frames(mapper, session_recording, session.config.window)
         result = mapper.finish()

@@ -149,8 +149,7 @@ class Stream(AbstractContextManager["Stream"], ABC):
         raise self._failed(f"sent no frame for {self.timeout_s:g} s")
 
     def _failed(self, problem: str) -> DeviceError:
-        remedy = "check its cable and power supply"
-        return DeviceError(problem, where=self._maker, remedy=remedy)
+        return DeviceError(problem, where=self._maker, remedy="check its cable and power supply")
 
     @abstractmethod
     def close(self) -> None:

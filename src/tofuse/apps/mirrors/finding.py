@@ -99,8 +99,7 @@ def _applied(
     result: Reconstruction, views: Sequence[View], noise: Noise, found: Sequence[_Found]
 ) -> Reconstruction:
     """Add mirrors to a result, the likeliest first, and remove what is behind them."""
-    posed = evenly_spaced(np.flatnonzero(result.has_pose), _ORIGINS)
-    origins = result.trajectory[posed, :3, 3]
+    origins = result.trajectory[evenly_spaced(np.flatnonzero(result.has_pose), _ORIGINS), :3, 3]
     cloud, mesh = result.cloud, result.mesh
     mirrors: list[Mirror] = []
     margin = 2 * noise.tolerance_m

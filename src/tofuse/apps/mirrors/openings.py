@@ -236,8 +236,7 @@ def _regions(
             continue
         rows, columns = np.nonzero(region)
         square = np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
-        places = (np.stack([rows, columns], 1)[:, None] + square).reshape(-1, 2)
-        hull = _hull(places)
+        hull = _hull((np.stack([rows, columns], 1)[:, None] + square).reshape(-1, 2))
         border = cv2.dilate(region, np.ones((5, 5), np.uint8)) > region
         convexity = cells / max(cv2.contourArea(hull.astype(np.float32)), 1e-9)
         framed = float(is_surface[border].mean()) if border.any() else 0.0

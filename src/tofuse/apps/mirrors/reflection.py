@@ -136,8 +136,7 @@ def predict(
     points, normals
         (N, 3) of the model.
     """
-    plane = opening.plane
-    in_front = plane.height(points) > 2 * noise.tolerance_m
+    in_front = opening.plane.height(points) > 2 * noise.tolerance_m
     points, normals = points[in_front], normals[in_front]
     phantom = mirror.reflected(points)
     points_of_none, none = np.zeros((0, 3)), np.zeros(0)

@@ -67,8 +67,7 @@ def pair_scene(result: PairResult) -> tuple[scene.Scene, fields.Field]:
         points.append(se3.transform(axes @ T, frame.points[chosen].astype(float)))
         directions = np.zeros((len(chosen), 3))
         if len(frame) > _NEIGHBOURS:
-            rows = frame.points, frame.normals
-            cloud = CloudFrame(0, 0.0, *rows, origin=frame.origin)
+            cloud = CloudFrame(0, 0.0, frame.points, frame.normals, origin=frame.origin)
             directions = surface_shape.normals_at(cloud, chosen.astype(np.int64))
         normals.append(directions @ (axes @ T)[:3, :3].T)
     spacing = max(map(scene.spacing_of, points))

@@ -51,8 +51,7 @@ class PairResult:
     @cached_property
     def in_files(self) -> Registration:
         """The registration in the coordinates of the files."""
-        near = NearOrigin(self.source.frame, self.target.frame, None)
-        return near.in_files(self.registration)
+        return NearOrigin(self.source.frame, self.target.frame, None).in_files(self.registration)
 
     @property
     def T_target_source(self) -> Float64:

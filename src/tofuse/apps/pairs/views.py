@@ -70,8 +70,7 @@ def named_view(
     """Read the view called `name`: the cloud of a result, or see `open_view`."""
     folder = Path(name)
     if format is None and folders.named_result(folder):
-        cloud = read_cloud(folder)
-        frame = CloudFrame.of(_checked(cloud.points, name))
+        frame = CloudFrame.of(_checked(read_cloud(folder).points, name))
         return SingleView(name, name, "result", 0, frame)
     return open_view(name, format=format, camera=camera, topic=topic, file_axes=True)
 

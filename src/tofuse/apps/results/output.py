@@ -73,8 +73,7 @@ def write_result(
         _write_files(result, staging, report, texture)
         if share and result.mesh is not None and len(result.mesh.faces):
             record = display_record(result.mesh) if texture is None else textured_record(texture)
-            R = result.T_up_world[:3, :3]
-            exchange.save(record, staging / "share.usdz", R)
+            exchange.save(record, staging / "share.usdz", result.T_up_world[:3, :3])
 
 
 def _write_files(

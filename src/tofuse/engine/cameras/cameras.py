@@ -112,8 +112,7 @@ class Pinhole:
 
     @cached_property
     def _lens(self) -> kernels.Lens:
-        names = kernels.Lens._fields[:-2]
-        values = [float(getattr(self, name, 0.0)) for name in names]
+        values = [float(getattr(self, name, 0.0)) for name in kernels.Lens._fields[:-2]]
         return kernels.Lens._make([*values, isinstance(self, Fisheye), self.tangential_factor])
 
     def _distort(self, xy: Float64) -> Float64:

@@ -42,8 +42,7 @@ def fitted(rays: Float32) -> Float32:
     squares = (xy**2).sum(-1)
     powers = _powers(squares)
     # Both coordinates together: their focal lengths differ by the shape of the pixels.
-    shape = np.array([1.0, _aspect(rays)])
-    distorted = (xy * shape)[:, :, None] * powers[:, None]
+    distorted = (xy * np.array([1.0, _aspect(rays)]))[:, :, None] * powers[:, None]
     ones = np.broadcast_to(np.eye(2), (len(xy), 2, 2))
     columns = np.concatenate([distorted, ones], -1).reshape(2 * len(xy), -1)
     found = np.linalg.lstsq(columns, uv.ravel(), rcond=None)[0]

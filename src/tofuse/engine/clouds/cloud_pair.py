@@ -281,8 +281,7 @@ def _registered(
     likely = (registration.probability or 0.0) > _LIKELY
     if registration.believed or likely or not views.has_assumed_viewpoint:
         return registration
-    blind = views.without_free_space()
-    other = _registered_views(blind, guess, image_registration, **options)
+    other = _registered_views(views.without_free_space(), guess, image_registration, **options)
     if other.believed:  # nothing shows which of the two is wrong: the pose or the viewpoint
         reason = "its free space contradicts it, if a cloud was seen from its origin"
         other = replace(other, believed=False, probability=_LIKELY, reason=reason)
@@ -434,8 +433,7 @@ def follow_clouds(
         coarse = CoarseToFine().register(source, target, guess, rng)
         alternative = replace(views.evaluated(coarse.T_target_source), guess=guess)
         local = max(local, alternative, key=lambda pose: pose.agreement.score)
-    registration = _registration(views, local)
-    return views.with_information(replace(registration, given_guess=True))
+    return views.with_information(replace(_registration(views, local), given_guess=True))
 
 
 def _proposed(

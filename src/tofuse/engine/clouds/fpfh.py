@@ -195,8 +195,7 @@ def _described(
             where=f"frame {view.index}",
         )
     near = fpfh(points, normals, reach * size, signed)
-    coarse = averaged(view, _SURROUNDINGS * size)
-    surroundings = _on_surfaces(coarse, neighbours)
+    surroundings = _on_surfaces(averaged(view, _SURROUNDINGS * size), neighbours)
     if len(surroundings[0]) < min_points:
         surroundings = points, normals
     far_reach = _SURROUNDINGS_REACH * _SURROUNDINGS * size

@@ -222,8 +222,7 @@ def distinct(
     points
         (n, 3) points that are moved, m.
     """
-    centre = np.median(points, 0)
-    moved = se3.transform(motions, centre[None])[:, 0]
+    moved = se3.transform(motions, np.median(points, 0)[None])[:, 0]
     rotations = motions[:, :3, :3].reshape(-1, 9)
     alike = cdist(moved, moved) <= options.distinct_m
     alike &= rotations @ rotations.T >= 1 + 2 * np.cos(options.distinct_rad)  # traces

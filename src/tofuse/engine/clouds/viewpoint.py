@@ -288,8 +288,7 @@ def _rendered(points: Float64, camera: Pinhole) -> tuple[Float32, Intp]:
     shape = camera.height, camera.width
     projected = camera.project(points)
     pixel = np.round(projected)
-    inside = (pixel >= 0).all(1) & (pixel < shape[::-1]).all(1)
-    index = np.flatnonzero(inside)
+    index = np.flatnonzero((pixel >= 0).all(1) & (pixel < shape[::-1]).all(1))
     pixel_index = (pixel[index, 1] * camera.width + pixel[index, 0]).astype(np.intp)
     z = points[index, 2]
     order = np.lexsort((z, pixel_index))

@@ -239,8 +239,7 @@ def _disagreement(pairs: Intp, T: Float64, C: Float64) -> float:
             jk, ik = row.get((j, k)), row.get((i, k))
             if jk is None or ik is None:
                 continue
-            T_k_j = se3.inverse(T[jk])
-            A = se3.adjoint(T_k_j)
+            A = se3.adjoint(se3.inverse(T[jk]))
             error = se3.log(se3.inverse(T[ik]) @ T[ij] @ T[jk])
             total = A @ C[ij] @ A.T + C[jk] + C[ik]
             found.append(float(error @ np.linalg.solve(total, error)))

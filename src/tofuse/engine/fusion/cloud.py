@@ -111,8 +111,7 @@ class CloudBuilder:
         """Add a (filtered) view at its pose."""
         if len(frame) == 0:
             return
-        points = frame.points.astype(float)
-        world = se3.transform(T_world_camera, points)
+        world = se3.transform(T_world_camera, frame.points.astype(float))
         to_camera = (T_world_camera[:3, :3] @ frame.origin + T_world_camera[:3, 3]) - world
         distance = np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-9)
         rows = np.zeros((len(world), 13))

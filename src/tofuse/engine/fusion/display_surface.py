@@ -148,8 +148,7 @@ def without_shards(mesh: Mesh, witnesses: Sequence[Witness]) -> Mesh:
     # Those that fused views would let expect, if the surface were not behind another one.
     expected = mesh.views * (np.median(seeing) / max(float(np.median(mesh.views)), 1))
     unseen = (seeing == 0) & (is_looked_at | ((hidden > 0) & (expected >= _EXPECTED)))
-    supported = ~few & ~unseen
-    return mesh.rows(supported[mesh.faces].sum(1) >= 2)
+    return mesh.rows((~few & ~unseen)[mesh.faces].sum(1) >= 2)
 
 
 def with_filled_holes(mesh: Mesh, witnesses: Sequence[Witness]) -> tuple[Mesh, int]:

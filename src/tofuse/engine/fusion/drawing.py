@@ -86,8 +86,7 @@ def _colors(
         texel = np.einsum("nk,nki->in", weight, texture[0][mesh.faces[faces]])
         return _sampled(texture[1], texel.astype(np.float32))
     assert mesh.color is not None
-    colors = np.einsum("nk,nki->ni", weight, mesh.color[mesh.faces[faces]])
-    return np.asarray(colors, np.float32)
+    return np.asarray(np.einsum("nk,nki->ni", weight, mesh.color[mesh.faces[faces]]), np.float32)
 
 
 def _sampled(image: np.ndarray, at: Float32) -> Float32:
@@ -95,5 +94,4 @@ def _sampled(image: np.ndarray, at: Float32) -> Float32:
     count, side = at.shape[1], 16_384
     rows = -(-count // side)
     u, v = (np.pad(x, (0, rows * side - count)).reshape(rows, side) for x in at)
-    sampled = cv2.remap(image, u, v, cv2.INTER_LINEAR).reshape(-1, 3)
-    return np.asarray(sampled[:count], np.float32)
+    return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR).reshape(-1, 3)[:count], np.float32)

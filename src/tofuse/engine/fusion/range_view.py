@@ -195,8 +195,7 @@ class RangeView:
             sampled[step // 2 :: step, step // 2 :: step] = True
             valid &= sampled
         z = self.z[valid].astype(np.float32) * np.float32(self.unit)
-        rays = self.projection.rays[valid]
-        points = np.concatenate([rays * z[:, None], z[:, None]], 1)
+        points = np.concatenate([self.projection.rays[valid] * z[:, None], z[:, None]], 1)
         color = amplitude = None
         if self.channels == 3:
             assert self.intensity is not None

@@ -168,8 +168,7 @@ class TextureView:
         known = self.known.astype(np.float32)
         sums = cv2.resize(self.small * known[..., None], size, interpolation=cv2.INTER_AREA)
         share = cv2.resize(known, size, interpolation=cv2.INTER_AREA)[..., None]
-        mean = sums / np.maximum(share, 1e-3)
-        return np.ascontiguousarray(mean, np.float32)
+        return np.ascontiguousarray(sums / np.maximum(share, 1e-3), np.float32)
 
 
 def albedo(frame: RangeFrame) -> Float32 | None:
@@ -425,8 +424,7 @@ def baked(mesh: Mesh, faces: int, size: int) -> Textured:
         facing |= ~facing.any(1, keepdims=True)
         closest = distance2.min(1, keepdims=True)
         weights = np.where((nearest >= 0) & facing, 1 / (distance2 + closest + 1e-12), 0)
-        colored = has_color(mesh.color)
-        colored_weights = weights * colored[nearest]
+        colored_weights = weights * has_color(mesh.color)[nearest]
         weights = np.where(colored_weights.any(1, keepdims=True), colored_weights, weights)
         colors = np.einsum("nk,nki->ni", weights, display_colors(mesh.color)[nearest].astype(float))
         colors /= weights.sum(1, keepdims=True)

@@ -257,8 +257,7 @@ class Dual:
         diagonal = np.zeros((len(self.multipliers), 4, 4))
         diagonal[:, 1:, 1:] = shift * np.eye(3) - self.multipliers
         diagonal[self._first, 0, 0] = self._jj[:, 0, 0].mean()  # holds the first translation
-        m = len(self._ii)
-        zero = np.zeros((m, 4))
+        zero = np.zeros((len(self._ii), 4))
         unary = diagonal, np.zeros((len(diagonal), 4))
         blocks = self._system.assemble(self._ii, self._ij, self._jj, zero, zero, unary)
         factor = self._system.factor(*blocks)

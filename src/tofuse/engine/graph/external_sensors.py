@@ -252,8 +252,7 @@ class GravityEdges(Bounded, ExternalSensor):
         # a single one with the shared error alone.
         inflation = 1 + float((self.shared_rad**2 / measured[:, 3] ** 2).sum())
         observed = (graph.poses[rows, :3, :3] @ measured[:, :3, None])[..., 0]
-        gravity = Gravity(rows, measured[:, :3], measured[:, 3], None, self.gate)
-        down = gravity.vertical(observed)
+        down = Gravity(rows, measured[:, :3], measured[:, 3], None, self.gate).vertical(observed)
         chi2 = ((observed - down / np.linalg.norm(down)) ** 2).sum(1) / measured[:, 3] ** 2
         used = int((chi2 <= self.gate).sum())
         measured[:, 3] *= np.sqrt(inflation)

@@ -58,8 +58,7 @@ class Problem:
             down = self.gravity.vertical(observed)
         # A rotation with down as its third axis; the other two are arbitrary.
         down = down / np.linalg.norm(down)
-        T = se3.pose(np.stack([*tangents(down), down], axis=1))
-        return np.concatenate([poses, T[None]])
+        return np.concatenate([poses, se3.pose(np.stack([*tangents(down), down], axis=1))[None]])
 
     def errors(self, poses: Float64) -> tuple[Float64, Float64]:
         """Return the errors of the edges (m, 6), and those of gravity (g, 3) over their sigma."""

@@ -166,8 +166,7 @@ class PairSystem:
     def gradient(self, g: Float64, T_i_j: Float64) -> Float64:
         """Return only the gradient (free poses x 6) of (m, 6) g, as in `relative`."""
         At = np.swapaxes(se3.adjoint(se3.inverse(T_i_j)), 1, 2)
-        g_i = -(At @ g[..., None])[..., 0]
-        return self.summed(g_i, g)
+        return self.summed(-(At @ g[..., None])[..., 0], g)
 
     def summed(self, g_i: Float64, g_j: Float64) -> Float64:
         """Return only the gradient (free poses x k) of (m, k) g_i and g_j, as in `assemble`."""

@@ -165,8 +165,7 @@ def shared_weights(matches: Matches, alignment: Alignment) -> Float64:
     With equal noise in both views, m pairs with one target point have the information of
     ``2 m / (1 + m)`` pairs with distinct target points.
     """
-    count = np.bincount(matches.target, minlength=len(alignment.target))
-    return 2 / (1 + count[matches.target])
+    return 2 / (1 + np.bincount(matches.target, minlength=len(alignment.target))[matches.target])
 
 
 def in_scales(residual: Float64, resolution: float) -> Float64:
@@ -244,8 +243,7 @@ def unobservable_directions(pairs: SurfacePairs, variance: float) -> Float64:
         pairs.points, pairs.target_normals, pairs.source_normals, pairs.weight, directions
     )
     constrained = (values > 1) & (cross > _MIN_SIGNAL_FRACTION * plain)
-    unobservable = directions[~constrained] @ se3.adjoint(se3.translation(pairs.centre)).T
-    return unit_vectors(unobservable)
+    return unit_vectors(directions[~constrained] @ se3.adjoint(se3.translation(pairs.centre)).T)
 
 
 class SurfaceMetric(Metric, Protocol):

@@ -415,8 +415,7 @@ class Locator:
                 )
                 p = evidence.probability
                 ends = placed.T_map_camera, self._poses[k]
-                independence = self._independence(ends, counted, k)
-                total += independence * float(np.log(p / (1 - p)))
+                total += self._independence(ends, counted, k) * float(np.log(p / (1 - p)))
                 counted.append(ends)
         return total
 

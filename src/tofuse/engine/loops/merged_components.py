@@ -138,8 +138,7 @@ def odometry_over(before: TrackedComponent, after: TrackedComponent) -> Link | N
     limit = np.repeat([CONVERGENCE * before.depth, CONVERGENCE], 3)
     if (sigma > limit).any():
         return None
-    method = "bridged by odometry"
-    return _link_over_gap(before, after, T, np.maximum(sigma, 0.1 * limit), method)
+    return _link_over_gap(before, after, T, np.maximum(sigma, 0.1 * limit), "bridged by odometry")
 
 
 def extrapolated(before: TrackedComponent, after: TrackedComponent) -> Link | None:
@@ -167,8 +166,7 @@ def extrapolated(before: TrackedComponent, after: TrackedComponent) -> Link | No
     )
     difference = np.abs(v[-2:].mean(0) - w[:2].mean(0))
     sigma = np.hypot(0.5 * random_walk, 0.5 * difference) * elapsed
-    depth = before.depth
-    limit = np.repeat([_MAX_SIGMA * depth, _MAX_SIGMA_RAD], 3)
+    limit = np.repeat([_MAX_SIGMA * before.depth, _MAX_SIGMA_RAD], 3)
     if (sigma > limit).any():
         return None
     T = retract(np.eye(4), 0.5 * (v[-2:].mean(0) + w[:2].mean(0)) * elapsed)
@@ -270,8 +268,7 @@ class MergedComponents:
 
     def T_merged(self, merged: MergedComponent, frame: int) -> Float64:
         """Return the (4, 4) T_merged_camera of a frame."""
-        T = merged.T[self.component_of[frame]] @ self._poses[frame]
-        return np.asarray(T, np.float64)
+        return np.asarray(merged.T[self.component_of[frame]] @ self._poses[frame], np.float64)
 
     def T_a_b(self, a: MergedComponent, b: MergedComponent, link: Link) -> Float64:
         """Return the (4, 4) T_a_b implied by a link from a to b, or from b to a."""
@@ -370,8 +367,7 @@ class MergedComponents:
 
     def merge(self, a: MergedComponent, b: MergedComponent, link: Link, joins: list[Join]) -> None:
         """Move the components of `b` into `a`, at the pose of a link."""
-        T_a_b = self.T_a_b(a, b, link)
-        a.T.update(transformed(b.T, T_a_b))
+        a.T.update(transformed(b.T, self.T_a_b(a, b, link)))
         a.joins += [*b.joins, *joins]
         for join in joins:
             self.add_path_nodes(join.link)

@@ -203,8 +203,7 @@ class _RevisitLoops(Loops):
         posed = self._chosen.of(poses)
         before = np.array([self._poses[p.index] for p in posed])
         change = se3.inverse(before) @ np.array([poses[p.index] for p in posed])
-        depth = np.array([p.depth for p in posed])
-        if se3.change_of_view(change, depth).max() <= _MAX_MOTION:
+        if se3.change_of_view(change, np.array([p.depth for p in posed])).max() <= _MAX_MOTION:
             return False
         # With other initial poses, rejected loops may be accepted.
         self._decisions = {p: c for p, c in self._decisions.items() if c.record.accepted}

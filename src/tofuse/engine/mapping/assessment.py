@@ -134,7 +134,8 @@ class Assessment:
         accuracy, covariances = self._accuracy(closed, refined, model, cross_view)
         accuracy = self._with_camera(accuracy, refined.refinement, cross_view)
         motion = _Motion.of(self.tracked.posed)
-        measured = self._measured_steps(closed.sensors)
+        # Frames to which verified odometry measures the step.
+        measured = frozenset(s.j for s in closed.sensors.steps if closed.sensors.verified)
         confirmed = self._confirmed(graph, motion, measured)
         ambiguous = self._ambiguous(graph)
         if (
@@ -200,10 +201,6 @@ class Assessment:
         """Median depths of the frames of this part, m."""
         depths = self.observations.depths.items()
         return tuple(d for index, d in depths if d > 0 and index in self.tracked.poses)
-
-    def _measured_steps(self, sensors: external_sensors.SensorPriors) -> frozenset[int]:
-        """Return the frames to which verified odometry measures the step."""
-        return frozenset(s.j for s in sensors.steps) if sensors.verified else frozenset()
 
     def _with_camera(
         self,

@@ -130,8 +130,7 @@ def tracked_clips(
             lost[index] = str(frame)
             continue
         past = past_frames(recording, index, config.window - 1)
-        filtered = preparation.process(frame, None, past, None)
-        step = tracker.push(filtered.for_tracking)
+        step = tracker.push(preparation.process(frame, None, past, None).for_tracking)
         if step.T_component_camera is None or step.surface is None:
             lost[index] = step.reason
             continue

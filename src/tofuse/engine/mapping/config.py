@@ -165,8 +165,7 @@ def _divided(changes: Mapping[str, Any]) -> Mapping[str, Any]:
     megabytes = changes.get("memory_mb")
     if type(megabytes) is not int:  # not requested, or rejected later
         return changes
-    part = {"fusion": {"memory_mb": voxels_mb(megabytes)}}
-    return dict(_merge(part, changes))
+    return dict(_merge({"fusion": {"memory_mb": voxels_mb(megabytes)}}, changes))
 
 
 def _merge(base: Any, change: Any) -> Any:

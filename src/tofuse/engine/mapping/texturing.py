@@ -62,8 +62,7 @@ def make_texture(
     if not size or mesh is None or not len(mesh.faces):
         return None
     colored = steadiest_frames(result, _colored(recording))
-    probed = evenly_spaced(colored, _PROBED)
-    if not required and not any(_has_color(recording, k) for k in probed):
+    if not required and not any(_has_color(recording, k) for k in evenly_spaced(colored, _PROBED)):
         return None
     all_frames = steadiest_frames(result) if len(colored) < _VIEWS else []
     frame_positions = sorted({*colored, *all_frames})

@@ -177,8 +177,7 @@ class _PredictedMotion:
 
     @cached_property
     def _error_model(self) -> motion_prediction.Prediction:
-        unobservable = [r.unobservable for r in self.records]
-        model = motion_prediction.Prediction.of(self.poses, unobservable)
+        model = motion_prediction.Prediction.of(self.poses, [r.unobservable for r in self.records])
         return model.with_max_growth() if self.conservative else model
 
     @cached_property

@@ -232,8 +232,7 @@ def trial(
         if (start, stride) not in runs_of_views:
             runs_of_views[start, stride] = views.run(start, stride)
     regressed = run_all([partial(_regressed, *run) for run in runs_of_views.values()])
-    results = [run for run in regressed if run is not None]
-    found = _pairs_of_sums(results, _FULL_BY_SURFACES)
+    found = _pairs_of_sums([run for run in regressed if run is not None], _FULL_BY_SURFACES)
     if not found.is_significant:
         return found
     by_halves = run_all([partial(views.by_halves, *run) for run in sorted(runs_of_views)])

@@ -612,8 +612,7 @@ def _aligned(C: Float64, poses: Float64, chosen: Bool) -> tuple[Float64, Float64
 
 def _remove_motion(C: Float64, motion: Float64, chosen: Bool) -> Float64:
     """Covariance (3m, 3m) after the best fit of motions (m, 3, k) of the chosen ones is removed."""
-    k = motion.shape[2]
-    flat = motion.reshape(-1, k)
+    flat = motion.reshape(-1, motion.shape[2])
     chosen_motion = np.where(np.repeat(chosen, 3)[:, None], flat, 0.0)
     projector = np.eye(len(flat)) - flat @ np.linalg.pinv(chosen_motion, rcond=1e-9)
     return np.asarray(projector @ C @ projector.T, np.float64)

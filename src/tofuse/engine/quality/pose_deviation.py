@@ -95,8 +95,7 @@ def _overlapping(views: Sequence[PosedView[PreparedView]], poses: Float64) -> In
         overlaps(sampled, poses, _PAIRS.overlap)[0], _PAIRS.neighbours
     )
     later = np.arange(1, len(views))
-    consecutive = np.stack([later - 1, later], 1)
-    return np.unique(np.concatenate([pairs, consecutive]), axis=0)
+    return np.unique(np.concatenate([pairs, np.stack([later - 1, later], 1)]), axis=0)
 
 
 _CONFIDENCE = 0.95

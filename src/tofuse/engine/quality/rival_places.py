@@ -49,8 +49,7 @@ def ambiguous_places(
     """
     if len({view.component for view in views}) < 2:
         return ()
-    places = _Places(sorted(views, key=lambda view: view.index), poses)
-    return places.ambiguous()
+    return _Places(sorted(views, key=lambda view: view.index), poses).ambiguous()
 
 
 class _Places:

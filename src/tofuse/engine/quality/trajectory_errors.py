@@ -151,8 +151,7 @@ def evaluate_trajectory(
         )
     T_estimate, T_reference = estimate[pairs[:, 0]], reference[pairs[:, 1]]
     T_align = align(T_estimate, T_reference)
-    aligned = T_align @ T_estimate
-    errors = aligned[:, :3, 3] - T_reference[:, :3, 3]
+    errors = (T_align @ T_estimate)[:, :3, 3] - T_reference[:, :3, 3]
     distances = np.linalg.norm(errors, axis=1)
     angles = angles_between(T_estimate, T_reference)
     if len(pairs) == 1:

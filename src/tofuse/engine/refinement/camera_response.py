@@ -96,8 +96,7 @@ class Response:
 
     def _of_views(self, pairs: Intp, view_count: int) -> Float64:
         """(N, K) gradients of the views at the estimates."""
-        residual_gradient = self.gradient + self.information * self.estimate()
-        return _by_view(residual_gradient, pairs, view_count)
+        return _by_view(self.gradient + self.information * self.estimate(), pairs, view_count)
 
     def _sigma(self, variance: Float64, view_count: int) -> Float64:
         """(K,) standard deviations, by the variances of the sums of the gradients."""
@@ -339,8 +338,7 @@ class Linearised:
         for section in range(SECTIONS):
             part = self.state.with_points([np.flatnonzero(s == section) for s in sections])
             part.evaluate(self.poses, self.errors, _ESTIMATE_ALL, self.state.options.rounds[-1])
-            equations = part.without_exposure(range(kernels.ERRORS))
-            first, second = self._derivatives(*equations, along)
+            first, second = self._derivatives(*part.without_exposure(range(kernels.ERRORS)), along)
             gradients.append(first.sum(0) + second.sum(0) @ estimate)
         return np.array(gradients)
 

@@ -181,8 +181,7 @@ def refine_clouds(clouds: Sequence[Float64], poses: Float64) -> Aligned:
     if factor is None:
         return _unmoved(start)
     i, j = system.pairs.T
-    relative = se3.inverse(poses[i]) @ poses[j]
-    covariance = factor.relative_covariances(relative)
+    covariance = factor.relative_covariances(se3.inverse(poses[i]) @ poses[j])
     initial_cells = _divided(points, start, size, _DIVISIONS)
     return Aligned(
         poses,

@@ -242,8 +242,7 @@ def refine(
     after = _support(state, shared)
     measured = _pairwise_measurements(poses, pairs, state)
     state.evaluate(start, np.zeros_like(errors), fixed_errors, last)
-    before = _support(state)
-    found = poses, start, errors, pairs, aligned.moved, before, after, *measured
+    found = poses, start, errors, pairs, aligned.moved, _support(state), after, *measured
     return Refined(*found, state.known_scales, shared, growth)
 
 

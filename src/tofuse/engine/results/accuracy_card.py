@@ -21,8 +21,7 @@ def card(result: Reconstruction) -> list[str]:
     d = result.diagnostics
     parts = [bound(d.accuracy, result.cloud.diagonal_m)]
     readable = sum(f.status != "skipped" for f in d.frames)
-    closed = sum(p.accepted for p in d.loops)
-    loops = count(closed, "loop")
+    loops = count(sum(p.accepted for p in d.loops), "loop")
     parts.append(f"{int(result.has_pose.sum())} of {readable} frames, {loops}")
     if weakest := weakest_frame(d.accuracy):
         parts.append(f"weakest: {weakest}")

@@ -179,8 +179,7 @@ def planar_poses(
     translations, count = translations @ upright_t, options.planar_candidates
     coarse_points = max(1, _PLANAR_POINTS // _COARSE_DIVISOR)
     scores = scorer(rotations, translations[None], coarse_points).ravel()
-    best = _highest(scores, _KEPT_PER_CANDIDATE * count)
-    i, j = np.divmod(best, len(translations))
+    i, j = np.divmod(_highest(scores, _KEPT_PER_CANDIDATE * count), len(translations))
     return _non_maximum_suppression(scorer, rotations[i], translations[j], _PLANAR_POINTS, count)
 
 
@@ -191,8 +190,7 @@ def full_poses(s: ResampledView, t: ResampledView, options: SearchOptions) -> Fl
     roll_ratio = options.roll / turn if turn else 1.0
     rotations = se3.so3_exp(_ellipsoid_nodes(_FULL_ANGLE, turn, (1.0, 1.0, roll_ratio)))
     translations = _ellipsoid_nodes(_FULL_STEP * depth, options.reach * depth, (1.0, 1.0, 1.0))
-    step = depth * max(_FULL_STEP, _FULL_ANGLE)
-    scorer = _Scorer(s, t, [None, None], step)
+    scorer = _Scorer(s, t, [None, None], depth * max(_FULL_STEP, _FULL_ANGLE))
     rotation_index, translation_index = _promising(
         scorer, rotations, translations, _FULL_STEP * depth, count
     )
@@ -268,8 +266,7 @@ def _non_maximum_suppression(
     scorer: _Scorer, R: Float64, x: Float64, points: int, count: int
 ) -> Float64:
     """Return the `count` best of poses R (N, 3, 3), x (N, 3), with non-maximum suppression."""
-    scores = scorer(R, x[:, None], points)[:, 0]
-    order = np.argsort(-scores, kind="stable")
+    order = np.argsort(-scorer(R, x[:, None], points)[:, 0], kind="stable")
     R, x = R[order], x[order]
     depth = 0.5 * (scorer.source.depth + scorer.target.depth)
     chosen = kernels.select_distinct(R, x, depth, 1.5 * scorer.reach, count)

@@ -104,8 +104,7 @@ def _reduce(phasors: Complex128, step: int) -> Float64:
     padded = np.zeros((h * step, w * step, 2))
     padded[:rows, :columns, 0] = phasors.real
     padded[:rows, :columns, 1] = phasors.imag
-    size = (w, h)
-    return np.asarray(cv2.resize(padded, size, interpolation=cv2.INTER_AREA), np.float64)
+    return np.asarray(cv2.resize(padded, (w, h), interpolation=cv2.INTER_AREA), np.float64)
 
 
 def _blur(small: Float64, sigma: float) -> Float64:

@@ -410,8 +410,7 @@ class Unwrap(Bounded, FrameCorrection):
         if signal is None:
             return 0.0
         radial, amplitude, period = signal
-        pitch = pixel_pitch(frame)
-        periods = count_periods(radial, amplitude, period, white, pitch, self.options)
+        periods = count_periods(radial, amplitude, period, white, pixel_pitch(frame), self.options)
         return white_amplitude(
             amplitude, (radial + periods * period).astype(np.float32), radial > 0
         )

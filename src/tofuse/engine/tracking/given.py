@@ -182,8 +182,7 @@ class _StatedTracker(Tracker):
         if stated.component not in self._trackers:
             # Another session of the component may have begun at another pose.
             self._trackers[stated.component] = _GivenTracker(self._odometry.options, np.eye(4))
-        tracker = self._trackers[stated.component]
-        step = tracker.push(frame, stated.T_component_camera, surface)
+        step = self._trackers[stated.component].push(frame, stated.T_component_camera, surface)
         registration = self._constrained(step, stated)
         return replace(
             step,

@@ -105,8 +105,7 @@ def _seen_at(view: PreparedView, T_view_other: Float64, z: Float32, rays: Float3
         x, y = ((v / depth).reshape(z.shape) for v in (x, y))
     x0, y0, per_x, per_y = view.projection.frame
     u, v = ((x - x0) * per_x).astype(np.float32), ((y - y0) * per_y).astype(np.float32)
-    outside = (-1e6, -1e6)
-    pixels = cv2.remap(view.projection.lookup, u, v, cv2.INTER_LINEAR, borderValue=outside)
+    pixels = cv2.remap(view.projection.lookup, u, v, cv2.INTER_LINEAR, borderValue=(-1e6, -1e6))
     column, row = np.moveaxis(np.rint(pixels), -1, 0)
     inside = (depth.reshape(z.shape) > 0) & (z > 0)
     inside &= (row >= 0) & (column >= 0) & (row < view.z.shape[0]) & (column < view.z.shape[1])

@@ -207,8 +207,7 @@ class _Tracked:
 
     @cached_property
     def _backward(self) -> UInt8:
-        T = se3.inverse(self.T_reference_view)
-        return _outcome(self.reference, self.view, T, self.scale)
+        return _outcome(self.reference, self.view, se3.inverse(self.T_reference_view), self.scale)
 
     def evidence(self, T_rival: Float64, *, shortcut: bool) -> _Evidence:
         """Compare both views at a rival's motion T_rival (4, 4).

@@ -162,8 +162,7 @@ class PreparedView:
             return self
         if step in self._subsampled:
             return self._subsampled[step]
-        first = step // 2
-        pixels = (slice(first, None, step),) * 2
+        pixels = (slice(step // 2, None, step),) * 2
         images: dict[str, Any] = {
             name: np.ascontiguousarray(image[pixels])
             for name in ("z", "sigma", "planes", "plane_variance", "albedo", "pixel_variance")
@@ -338,8 +337,7 @@ def _amplitude(frame: RangeFrame) -> Float32 | None:
     color = np.ascontiguousarray(frame.color_image)
     grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
     unsaturated = cv2.inRange(color, (0, 0, 0), (_MAX_LEVEL - 1,) * 3) > 0
-    usable = (grey >= _MIN_LEVEL) & unsaturated
-    return np.where(usable, grey, 0).astype(np.float32)
+    return np.where((grey >= _MIN_LEVEL) & unsaturated, grey, 0).astype(np.float32)
 
 
 def _halve(z: Float32, amplitude: Float32, variance: Float32) -> list[Float32]:

@@ -167,8 +167,7 @@ def edge_pixels(w: Float32, jump: float, margin: int) -> Bool:
 
     Due to the blur of the lens they mix light of both sides.
     """
-    limit = np.float32(min(jump, 0.9))
-    return _edge_pixels(w, [limit] * 2, margin)
+    return _edge_pixels(w, [np.float32(min(jump, 0.9))] * 2, margin)
 
 
 def edge_pixels_by_noise(w: Float32, noise: Float32, options: SurfaceOptions) -> Bool:

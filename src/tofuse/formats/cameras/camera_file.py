@@ -341,8 +341,7 @@ def _lens(get: _Fields) -> tuple[Pinhole | None, tuple[int, int]]:
         raise get.error("distortion", f"is {coefficients!r:.60}", f"use a list [{' '.join(order)}]")
     for k, value in enumerate(coefficients):
         _Fields({f"distortion[{k}]": value}, get.where).number(f"distortion[{k}]", required=True)
-    extra = coefficients[len(order) :]
-    if any(extra):
+    if any(coefficients[len(order) :]):
         raise get.error(
             "distortion",
             f"has {quantities.count(len(coefficients), 'number')}, "

@@ -52,8 +52,7 @@ def _nearest_pixels(camera: Camera, pinhole: Pinhole) -> tuple[Intp, Bool]:
         & (uv[..., 0] < camera.width)
         & (uv[..., 1] < camera.height)
     )
-    pixels = np.where(inside[..., None], uv, 0).astype(np.intp)[..., ::-1]
-    return pixels, inside
+    return np.where(inside[..., None], uv, 0).astype(np.intp)[..., ::-1], inside
 
 
 class Rectifier:

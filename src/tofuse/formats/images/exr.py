@@ -110,8 +110,7 @@ def _block(data: bytes, size: int, compression: int) -> UInt8:
 
 def _header(data: bytes) -> _Header:
     if not data.startswith(MAGIC):
-        problem = "is empty" if not data else "is not an OpenEXR image"
-        raise InputError(problem)
+        raise InputError("is empty" if not data else "is not an OpenEXR image")
     (version,) = _unpack("<I", data, 4)
     if version & ~_LONG_NAMES != _SINGLE_SCAN_LINES:
         raise InputError(

@@ -366,8 +366,7 @@ def tiff_size(data: bytes) -> tuple[int, int]:
     """
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
     if order is None:
-        problem = "is empty" if not data else "is not a TIFF image"
-        raise InputError(problem)
+        raise InputError("is empty" if not data else "is not a TIFF image")
     try:
         tags = _tags(data, order)
         width, height = tags[_WIDTH][0], tags[_HEIGHT][0]

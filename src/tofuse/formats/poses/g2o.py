@@ -155,8 +155,7 @@ def _projected(information: Float64, path: str | Path, line_numbers: list[int]) 
     rounded = values[:, 0] < -_ROUNDING * values[:, -1]
     count = int(rounded.sum())
     if count:
-        V = vectors[rounded]
-        root = V * np.sqrt(np.maximum(values[rounded], 0))[:, None, :]
+        root = vectors[rounded] * np.sqrt(np.maximum(values[rounded], 0))[:, None, :]
         projected = root @ np.swapaxes(root, 1, 2)
         information[rounded] = (projected + np.swapaxes(projected, 1, 2)) / 2
         warnings.warn(

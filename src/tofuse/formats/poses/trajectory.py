@@ -146,8 +146,7 @@ def write_kitti(path: str | Path, poses: ArrayLike) -> None:
 
     The format has no timestamps and no gaps: poses that are NaN are skipped.
     """
-    T = _finite_poses(poses)
-    rows = T[:, :3].reshape(-1, 12).tolist()
+    rows = _finite_poses(poses)[:, :3].reshape(-1, 12).tolist()
     atomic.write_text(path, "".join(" ".join(tables.exact(v) for v in row) + "\n" for row in rows))
 
 

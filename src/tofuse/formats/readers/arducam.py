@@ -69,8 +69,7 @@ class ArducamSource(FileSource):
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
         depth = depth_counts.depth_from_numbers(self._floats(self.depth[index]), self.unit)
-        confidence = self._confidence(self.confidence[index])
-        return self.image(index, depth, confidence_image=confidence)
+        return self.image(index, depth, confidence_image=self._confidence(self.confidence[index]))
 
     def _confidence(self, image: _Image | None) -> UInt8 | None:
         if image is None:

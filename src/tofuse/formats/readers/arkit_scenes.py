@@ -75,8 +75,7 @@ def _times(files: list[Path]) -> Float64:
 def _of_frames(folder: Path, suffix: str, times: Float64) -> list[Path | None]:
     """The file of each frame; None where there is none."""
     files = inputs.files_at(folder, suffix)
-    found = partners(times, _times(files), _LIMIT_S)
-    return [files[k] if k >= 0 else None for k in found]
+    return [files[k] if k >= 0 else None for k in partners(times, _times(files), _LIMIT_S)]
 
 
 def _lens(file: Path, lens: Path | None, size: tuple[int, int]) -> Pinhole:

@@ -192,8 +192,7 @@ class AzureKinectSource(FileSource):
         if track is None or not track.blocks:
             return [None] * len(self.depth)
         depth_times = np.array([b.time_ns - delay for b in self.depth]) / 1e9
-        times = np.array([b.time_ns for b in track.blocks]) / 1e9
-        pairs = partners(depth_times, times, limit)
+        pairs = partners(depth_times, np.array([b.time_ns for b in track.blocks]) / 1e9, limit)
         if (pairs < 0).any():
             self.warnings.append(
                 f"{int((pairs < 0).sum())} of {len(pairs)} frames have no {track.name} image"
@@ -279,8 +278,7 @@ def _calibration(data: bytes | None, where: str) -> dict[str, Any]:
         raise InputError(
             "is missing", where=where, remedy="pass the depth camera with --camera camera.json"
         )
-    remedy = "pass the depth camera with --camera"
-    return reading.parse_json(data.rstrip(b"\0"), where, remedy)
+    return reading.parse_json(data.rstrip(b"\0"), where, "pass the depth camera with --camera")
 
 
 def _lens(

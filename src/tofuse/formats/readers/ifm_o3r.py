@@ -354,8 +354,7 @@ class IfmH5Source(FileSource):
         counts = self._image(row, "distance")
         stored = np.asarray(row["intrinsicCalibModelParameters"], float).ravel()
         unit, model = float(row["distanceResolution"]), int(row["intrinsicCalibModelID"])
-        parameters = tuple(stored[:_PARAMETERS].tolist())
-        info = checked_info(unit, model, parameters, self.where(index))
+        info = checked_info(unit, model, tuple(stored[:_PARAMETERS].tolist()), self.where(index))
         images = {
             name: self._image(row, field, counts.shape)
             for name, field in _FIELDS.items()

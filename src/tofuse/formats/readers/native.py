@@ -73,8 +73,7 @@ class NativeSource(FileSource):
         self.unit, self.kind = self.description.depth_unit_m, self.description.depth_kind
         self.amplitude_kind = self.description.amplitude_kind or "raw"
         self.ambiguity_m = self.description.ambiguity_m
-        rate = self.description.frame_rate_hz
-        super().__init__(np.arange(len(self.files)) / (rate or 1.0))
+        super().__init__(np.arange(len(self.files)) / (self.description.frame_rate_hz or 1.0))
         self.read_sidecars(folder)
         self.amplitude = self._channel_files("amplitude", ".png")
         self.confidence = self._channel_files("confidence", ".png")

@@ -183,8 +183,7 @@ class _Frame:
         rows = self.entry.get("transform_matrix")
         if isinstance(rows, list) and len(rows) == 3:
             rows = [*rows, [0, 0, 0, 1]]
-        table = reading.matrix_of(rows, where, _REMEDY)
-        return inputs.read_matrix_pose(table, where) @ OPENGL
+        return inputs.read_matrix_pose(reading.matrix_of(rows, where, _REMEDY), where) @ OPENGL
 
     def number_of(self, name: str, default: float | None = None) -> float:
         if name in self.entry:

@@ -78,8 +78,7 @@ class _Scan:
         pose = None
         with suppress(InputError):  # reported when the file is opened
             pose = self.pose()
-        up = cloud_files.up_in_scan(pose)
-        return cloud_files.cloud_frame(index, timestamp, cloud, up=up)
+        return cloud_files.cloud_frame(index, timestamp, cloud, up=cloud_files.up_in_scan(pose))
 
 
 def _scans(path: Path) -> list[_Scan]:

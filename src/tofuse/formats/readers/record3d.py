@@ -246,8 +246,7 @@ class _Metadata:
         field, table = "perFrameIntrinsicCoeffs", np.zeros((0, 4))
         if self.data.get(field):
             table = reading.numbers_in(self.data, field, self.where, (-1, 4), _REMEDY, finite=False)
-        common = phones.phone_lens(K, full_size, size, f"{self.where}: K")
-        lenses = [common] * len(numbers)
+        lenses = [phones.phone_lens(K, full_size, size, f"{self.where}: K")] * len(numbers)
         for k, number in enumerate(numbers):
             if number < len(table) and np.isfinite(table[number]).all():
                 K[[0, 1, 0, 1], [0, 1, 2, 2]] = table[number]

@@ -142,8 +142,7 @@ def timestamps(files: list[Path]) -> Float64 | None:
     """Return seconds from names like 000001-000000033369.png (microseconds), else None."""
     matches = [_MICROSECONDS.fullmatch(f.stem) for f in files]
     times = np.array([int(m.group(1)) / 1e6 for m in matches if m])
-    increase = len(times) == len(files) and (np.diff(times) > 0).all()
-    return times if increase else None
+    return times if len(times) == len(files) and (np.diff(times) > 0).all() else None
 
 
 def color_files(

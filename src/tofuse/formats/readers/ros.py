@@ -299,8 +299,7 @@ class RosSource(bags.BagSource):
 
     def _relate_color(self, track: bags.Track, transforms: bags.Transforms) -> bool:
         """Use a colour camera, if its intrinsics and pose relative to depth are known."""
-        topic = track.connection.topic
-        first = self.read_color(track, 0, f"{self.path}: {topic}")
+        first = self.read_color(track, 0, f"{self.path}: {track.connection.topic}")
         depth_frame, color_frame = self._frame_of(self.depth), self._frame_of(track)
         registered = _rank(self.connection) == 1  # depth is registered to colour
         same_size = first.shape[:2] == (self.camera.height, self.camera.width)

@@ -106,8 +106,7 @@ def _camera(folder: Path, files: Sequence[Path], default: _Camera, warnings: lis
         path = place / _INTRINSICS
         if reading.is_file(path):
             K = tables.read_3x3(path, "write three rows of three")
-            lens = camera_file.checked_pinhole(K, first_size(files), path)
-            return replace(default, lens=lens)
+            return replace(default, lens=camera_file.checked_pinhole(K, first_size(files), path))
         info = reading.first_file(*(place / name for name in _INFO))
         if info is not None and _INFO_LENS.encode() in reading.read_head(info, 4096):
             return _read_info(info, warnings)
@@ -141,5 +140,4 @@ def _read_info(path: Path, warnings: list[str]) -> _Camera:
         )
         T = inputs.color_from_depth(warnings, T_device_color, T_device_depth, path)
         color = camera_file.ColorCamera(lens("Color"), T)
-    sensor = " ".join(cells.get("m_sensorName", []))
-    return _Camera(lens("Depth"), sensor, unit, color)
+    return _Camera(lens("Depth"), " ".join(cells.get("m_sensorName", [])), unit, color)

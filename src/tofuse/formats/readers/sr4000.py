@@ -96,8 +96,7 @@ class Sr4000Source(FileSource):
             )
         times = inputs.interpolated(times)
         # Frames stay in sequence where the camera's counter restarts.
-        step = np.diff(times, prepend=times[0])
-        if (step < 0).any():
+        if (np.diff(times, prepend=times[0]) < 0).any():
             self.warnings.append("timestamps decrease; frames stay in the order of files")
         self.timestamps = times
 

@@ -85,8 +85,7 @@ def _check_rotated(stored: UInt16, folder: Path) -> None:
 
 def _reference(path: Path, color: list[Path | None], warnings: list[str]) -> Float64 | None:
     """The poses (N, 4, 4) of the colour images in the latest file, three rows for each."""
-    folder = path / "extrinsics"
-    files = inputs.files_at(folder, ".txt")
+    files = inputs.files_at(path / "extrinsics", ".txt")
     if not files or not color:
         return None
     images = redwood.color_images(path / "image")

@@ -41,7 +41,9 @@ class Tiff(Reader):
     def open(self, path: Path, options: ReaderOptions) -> TiffSource:
         """See `Reader.open`."""
         files = reading.files_with(path, *_SUFFIXES) if reading.is_folder(path) else []
-        depth = [f for f in files if _is_range(f)] or [f for f in files if not _is_other(f)]
+        depth = [f for f in files if _is_range(f)] or [
+            f for f in files if not _is_named(f, _NOT_DEPTH)
+        ]
         inputs.required(depth, ".tif of depth", path, "pass the folder of images")
         if options.camera is None:
             raise InputError(
@@ -49,7 +51,7 @@ class Tiff(Reader):
                 where=path,
                 remedy="use --camera camera.json with lens, depth_unit_m and depth_kind",
             )
-        amplitude = [f for f in files if f not in depth and _is_amplitude(f)]
+        amplitude = [f for f in files if f not in depth and _is_named(f, _AMPLITUDE_KEYWORDS)]
         return TiffSource(path, depth, amplitude, options.camera)
 
 
@@ -93,9 +95,5 @@ def _is_range(file: Path) -> bool:
     return Path(file.stem).suffix.lower() == _RANGE
 
 
-def _is_amplitude(file: Path) -> bool:
-    return any(keyword in file.stem.lower() for keyword in _AMPLITUDE_KEYWORDS)
-
-
-def _is_other(file: Path) -> bool:
-    return any(keyword in file.stem.lower() for keyword in _NOT_DEPTH)
+def _is_named(file: Path, keywords: Sequence[str]) -> bool:
+    return any(keyword in file.stem.lower() for keyword in keywords)

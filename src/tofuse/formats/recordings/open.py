@@ -395,8 +395,7 @@ def _check_usable(source: Source, path: str | Path) -> None:
         reading.first_readable(range(count), source.read, nothing)
     except UnreadableFrameError as first:
         if count > 1:
-            problem = f"none of {count} frames can be read: {first}"
-            raise InputError(problem, where=path) from first
+            raise InputError(f"none of {count} frames can be read: {first}", where=path) from first
         raise InputError(first.problem, where=first.where, remedy=first.remedy) from first
 
 

@@ -144,8 +144,7 @@ class CloudFileSource(FileSource):
                 f"{path}: not 'index x y z qw qx qy qz', ignored; use groundtruth.txt (TUM)"
             )
             return None
-        norms = quaternion.length(table[:, 4:])
-        if (np.abs(norms - 1) > 0.1).any():
+        if (np.abs(quaternion.length(table[:, 4:]) - 1) > 0.1).any():
             raise InputError(
                 "contains quaternions that are not of unit length",
                 where=path,

@@ -216,13 +216,11 @@ class DepthImageSource(FileSource):
         if sensor:
             self.metadata["sensor"] = sensor
         self.note_missing_color(self.color)
-        remedy = "pass the camera of these images with --camera"
-        check_first_size(self.files, size, where, remedy)
+        check_first_size(self.files, size, where, "pass the camera of these images with --camera")
 
     def load(self, index: int) -> RangeFrame:
         """See `FileSource.load`."""
-        size = (self.camera.width, self.camera.height)
-        counts = self.read_counts(index, size)
+        counts = self.read_counts(index, (self.camera.width, self.camera.height))
         frame = self.image(index, depth_counts.depth_from_counts(counts, self.unit))
         path = self.color[index]
         if path is None:

@@ -416,8 +416,7 @@ class _Lattice:
             return None
         variables = (slopes[consistent] - self.centre) / reach
         fit = np.linalg.lstsq(_powers(variables, degree), pixel[consistent], rcond=None)[0]
-        terms = np.asarray(fit, np.float64)
-        return _Lattice(self.centre, reach, degree, terms)
+        return _Lattice(self.centre, reach, degree, np.asarray(fit, np.float64))
 
     def __call__(self, slopes: Float64) -> Float64:
         """Return columns and rows (N, 2) of slopes (N, 2)."""

@@ -48,8 +48,7 @@ def sampled_color(
     u, v = np.clip(pixel, -1, 1 << 20).astype(np.intp).T
     inside = (u >= 0) & (v >= 0) & (u < image.shape[1]) & (v < image.shape[0])
     cell = _cell(frame, color)
-    occluded = _occluded(u[inside] // cell, v[inside] // cell, points[inside, 2])
-    inside[inside] = ~occluded
+    inside[inside] = ~_occluded(u[inside] // cell, v[inside] // cell, points[inside, 2])
     sampled = np.zeros((len(u), 3), np.uint8)
     sampled[inside] = image[v[inside], u[inside]]
     out = np.zeros((*frame.depth.shape, 3), np.uint8)
@@ -59,8 +58,7 @@ def sampled_color(
 
 def _cell(frame: RangeFrame, color: camera_file.ColorCamera) -> int:
     """Size in colour pixels of cells that each contain points of a continuous surface."""
-    rays = frame.camera.rays()
-    pitch = float(np.nanmedian(np.abs(np.diff(rays[..., 0], axis=1))))
+    pitch = float(np.nanmedian(np.abs(np.diff(frame.camera.rays()[..., 0], axis=1))))
     return max(1, int(np.ceil(2 * pitch * color.camera.fx)))
 
 

@@ -119,8 +119,7 @@ def _grid(target: interfaces.Points) -> tuple[RangeFrame, Int64]:
             remedy="use the matcher 'closest-point'",
         )
     grid = np.full(view.valid.shape, -1, np.int64)
-    pixels = np.flatnonzero(view.valid)[target.index]
-    grid.ravel()[pixels] = np.arange(len(target))
+    grid.ravel()[np.flatnonzero(view.valid)[target.index]] = np.arange(len(target))
     return view, grid
 
 

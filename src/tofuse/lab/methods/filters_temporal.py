@@ -49,8 +49,7 @@ class TemporalDeviation(Bounded, Filter):
         past = [
             f.z for f in history if isinstance(f, RangeFrame) and f.depth.shape == frame.depth.shape
         ]
-        deviation = z_deviation([*past[-(self.frames - 1) :], frame.z])
-        return ~(deviation > self.threshold)
+        return ~(z_deviation([*past[-(self.frames - 1) :], frame.z]) > self.threshold)
 
 
 def z_deviation(z: Sequence[Float32]) -> Float64:

@@ -50,8 +50,7 @@ class Implicit(Bounded, surface_metrics.SurfaceMetric):
         target, h = alignment.target, self.width * alignment.resolution
         tree = neighbourhood(target).tree
         index, distance2 = tree.neighbours(x, min(target.neighbours, len(tree)))
-        normals = target.normals[index]
-        height = ((x[:, None] - target.points[index]) * normals).sum(2)
+        height = ((x[:, None] - target.points[index]) * target.normals[index]).sum(2)
         W = np.exp(-distance2 / h**2)
         W[(distance2 > (_CUTOFF * h) ** 2) | ~np.isfinite(height)] = 0.0
         total = W.sum(1)

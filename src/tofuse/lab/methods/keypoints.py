@@ -88,8 +88,7 @@ def channel_image(frame: RangeFrame, channel: Channel) -> UInt8:
     levels = np.clip((grey - low) / max(float(high - low), 1e-6), 0, 1) * 255
     # Holes are filled from their surroundings, or their rims would be detected.
     image: UInt8 = np.where(valid, levels, 0).astype(np.uint8)
-    filled = cv2.medianBlur(image, 5)
-    return np.where(valid, image, filled).astype(np.uint8)
+    return np.where(valid, image, cv2.medianBlur(image, 5)).astype(np.uint8)
 
 
 def keypoints(

@@ -179,8 +179,7 @@ class _KissTracker(Tracker):
             weight = (scale2 / (scale2 + distance2[matched])) ** 2
             pairs = interfaces.Matches(matched, index[matched], np.sqrt(distance2[matched]), weight)
             alignment = interfaces.Alignment(source, target, self._map.size, T, x)
-            motion = metric.motion(pairs, alignment)
-            T = se3.orthonormalise(motion @ T)
+            T = se3.orthonormalise(metric.motion(pairs, alignment) @ T)
             displacement = icp_kernels.transform_points(T, p) - x
             converged = float(np.abs(displacement).max()) < _CONVERGENCE * self._map.size
         relative = se3.inverse(self._pose) @ T

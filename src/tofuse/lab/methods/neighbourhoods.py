@@ -115,8 +115,7 @@ def _fitted_mean_curvature(points: interfaces.Points) -> Float64:
     view, count = points.view, min(points.neighbours, len(points.view))
     index, _ = surface_shape.tree_of(view).neighbours(points.points, count)
     near, normals = view.points.astype(np.float64)[index], points.shape.normals
-    offsets = near - near.mean(1, keepdims=True)
-    A, w, scale = _quadric(offsets, normals, tangents(normals))
+    A, w, scale = _quadric(near - near.mean(1, keepdims=True), normals, tangents(normals))
     A = np.concatenate([A, np.ones_like(w)[..., None]], 2)
     At = np.swapaxes(A, 1, 2)
     M, g = At @ A, At @ w[..., None]

@@ -65,15 +65,13 @@ def information_of(pairs: robust_motion.Pairs, T_target_source: Float64) -> Floa
     degrees_of_freedom = max(3 * len(p) - 6, 1)
     scale = max(1.0, float((residual**2 / pairs.variance[:, None]).sum()) / degrees_of_freedom)
     J = se3.point_jacobian(p)
-    weight = 1 / (scale * pairs.variance)
-    return np.asarray(np.einsum("kai,kaj,k->ij", J, J, weight), np.float64)
+    return np.asarray(np.einsum("kai,kaj,k->ij", J, J, 1 / (scale * pairs.variance)), np.float64)
 
 
 def weakly_constrained_directions(information: Float64) -> Float64:
     """Return the unit directions (k, 6) whose sigma exceeds 1 cm or 1 degree."""
     values, vectors = np.linalg.eigh(information * projective.UNITS[:, None] * projective.UNITS)
-    weak = vectors[:, values < 1].T * projective.UNITS
-    return unit_vectors(weak)
+    return unit_vectors(vectors[:, values < 1].T * projective.UNITS)
 
 
 def registration_of(

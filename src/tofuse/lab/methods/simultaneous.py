@@ -78,8 +78,7 @@ def solve_correspondences(
             H = np.einsum("jkl,jml->km", np.delete(Q[k], k, 0), np.delete(R, k, 0))
             if H.any():
                 R[k] = se3.nearest_rotation(H.T)
-        error = -float(np.einsum("iab,ijbc,jac->", R, Q, R))
-        errors.append(error)
+        errors.append(-float(np.einsum("iab,ijbc,jac->", R, Q, R)))
         if len(errors) > 1 and errors[-2] - errors[-1] <= _MIN_RELATIVE_DECREASE * abs(errors[-1]):
             break
     out = se3.pose(R, -laplacian_inverse @ np.einsum("kab,ikb->ia", R, first_moment))

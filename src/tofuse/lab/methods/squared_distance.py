@@ -32,8 +32,7 @@ class SquaredDistance(surface_metrics.SurfaceMetric):
     def motion(self, matches: interfaces.Matches, alignment: interfaces.Alignment) -> Float64:
         """See `Metric.motion`."""
         pairs = surface_metrics.surface_pairs(matches, alignment)
-        usable = with_normals(matches, alignment)
-        W = approximant(usable, alignment)
+        W = approximant(with_normals(matches, alignment), alignment)
         R = alignment.T_target_source[:3, :3]
         H, g, _ = icp_kernels.matrix_sums(
             pairs.points, pairs.residual, np.einsum("ji,njk,kl->nil", R, W, R), pairs.weight

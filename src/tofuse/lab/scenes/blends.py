@@ -119,8 +119,7 @@ def _quads(cut: Bool, inside: Bool, index: Int64, axis: int) -> Int64:
         cell[:, k] += dk
         cells.append(index[tuple(cell.T)])
     quads = np.stack(cells, -1)
-    outward = inside[tuple(edges.T)]
-    return np.where(outward[:, None], quads, quads[:, ::-1])
+    return np.where(inside[tuple(edges.T)][:, None], quads, quads[:, ::-1])
 
 
 def project_to_surface(shape: Shape, vertices: Float64, step: float) -> Float64:

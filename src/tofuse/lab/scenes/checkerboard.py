@@ -71,8 +71,7 @@ def camera_poses(seed: int) -> Float64:
         direction = np.array(
             [np.sin(tilt) * np.cos(azimuth), -np.cos(tilt), np.sin(tilt) * np.sin(azimuth)]
         )
-        position = np.array([0, 0, _HEIGHT]) + d * direction
-        T = paths.look_at(position, (0, 0, _HEIGHT))
+        T = paths.look_at(np.array([0, 0, _HEIGHT]) + d * direction, (0, 0, _HEIGHT))
         # Off-centre, within a narrow field of view at this distance, and rolled.
         margin = np.radians([21.0, 17.0]) - np.arctan([0.45 / d, 0.35 / d])
         offset = rng.uniform(-1, 1, 2) * np.maximum(margin, np.radians(3)) * 0.9

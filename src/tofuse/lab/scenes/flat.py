@@ -152,8 +152,7 @@ def _study(assembly: Assembly, T: Float64, rng: np.random.Generator, room: int) 
 
 def _living(assembly: Assembly, T: Float64, rng: np.random.Generator, room: int) -> None:
     household.sofa(assembly.at(T @ placed((-1.72, -0.4), 0.0)), FABRICS[1])
-    low = T @ placed((-1.0, -1.35), 0.3)
-    household.table(assembly.at(low), household.BIRCH, (0.6, 0.9), 0.42)
+    household.table(assembly.at(T @ placed((-1.0, -1.35), 0.3)), household.BIRCH, (0.6, 0.9), 0.42)
     household.shelf(assembly.at(T @ placed((0.9, -HALF + 0.01), np.pi / 2)), rng, 1.6, 4)
     household.floor_lamp(assembly.at(T @ placed((-1.8, 0.85), 0.0)))
     furniture.plant(assembly.at(T @ placed((1.7, 1.7), 0.0)), rng)

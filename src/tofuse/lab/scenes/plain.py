@@ -29,8 +29,7 @@ def plan(options: SceneOptions) -> ScenePlan:
     elif options.name == "hall":
         shell(assembly, (-4, -4, 0), (4, 4, 3), [SIDE, WALL, SIDE, WALL], FLOOR, CEILING)
         for x, y, height in ((-1.6, 0.4, 1.1), (0.8, -1.2, 0.8), (1.9, 1.7, 1.9)):
-            crate = meshes.box_between((x, y, 0), (x + 0.7, y + 0.6, height))
-            assembly.add(CRATE, crate)
+            assembly.add(CRATE, meshes.box_between((x, y, 0), (x + 0.7, y + 0.6, height)))
         camera = paths.look_at((-3.4, -3.4, 1.5), (0, 0, 1.1))
         path = paths.sway(camera, (0.2, 0.1, 0.2, 0.05, 0.6, 0.03), options.seconds)
     else:

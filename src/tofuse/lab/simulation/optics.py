@@ -422,5 +422,4 @@ def _blur_operators(size: int, step: int, sigma: float) -> tuple[Float64, Float6
     distance = (nodes[:, None] - nodes) * step
     blur = np.exp(-0.5 * (distance / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
     position = np.clip((pixels - (step - 1) / 2) / step, 0, len(nodes) - 1)
-    up = np.maximum(0, 1 - np.abs(position[:, None] - nodes))
-    return up, blur @ sums
+    return np.maximum(0, 1 - np.abs(position[:, None] - nodes)), blur @ sums

@@ -53,8 +53,7 @@ def peaks_cameras() -> Float64:
     the object's second axis (height) is up, so camera axes are x right, y down, z forward.
     """
     a = 2 * np.pi * np.arange(CAMERAS) / CAMERAS
-    zero = np.zeros(CAMERAS)
-    position = RADIUS_M * np.stack([np.sin(a), zero, -np.cos(a)], -1)
+    position = RADIUS_M * np.stack([np.sin(a), np.zeros(CAMERAS), -np.cos(a)], -1)
     down, forward = np.broadcast_to([0.0, -1, 0], position.shape), -position / RADIUS_M
     return se3.pose(np.stack([np.cross(down, forward), down, forward], -1), position)
 
@@ -90,6 +89,5 @@ def peaks_views(sigma: float, seed: int) -> tuple[list[CloudFrame], Float64]:
     for k, (T, rows) in enumerate(zip(T_object_camera, peaks_visible(), strict=True)):
         points_camera = se3.transform(se3.inverse(T), points[rows])
         noise = np.random.default_rng([seed, k]).normal(size=points_camera.shape)
-        cloud = (points_camera + sigma * noise).astype(np.float32)
-        views.append(CloudFrame(k, float(k), cloud))
+        views.append(CloudFrame(k, float(k), (points_camera + sigma * noise).astype(np.float32)))
     return views, se3.inverse(T_object_camera[0]) @ T_object_camera

@@ -106,8 +106,7 @@ def render(
 
     phase_images = _phase_images(model, effects, taps, bounced)
     exposure = phase_images.exposure(model, effects, scene.ambient)
-    rng = np.random.default_rng([seed, index])
-    measured = sensor.expose(model, effects, exposure, rng)
+    measured = sensor.expose(model, effects, exposure, np.random.default_rng([seed, index]))
     expected = sensor.expose(model, effects, exposure, None)
     ranges = _add_offsets(model, effects, measured.range_m, time_s)
     if not effects.wrap:

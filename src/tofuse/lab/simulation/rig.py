@@ -137,8 +137,7 @@ def wander(centre: SequenceOf[float], radii: SequenceOf[float], seconds: float) 
         offset = [radii[0] * np.cos(u), radii[1] * np.sin(u), 0.12 * np.sin(2.3 * u)]
         position = np.add(mean_position, offset)
         heading = u + 0.5 * np.sin(1.7 * u)
-        target = np.add(position, [np.cos(heading), np.sin(heading), 0.0])
-        T = look_at(position, target)
+        T = look_at(position, np.add(position, [np.cos(heading), np.sin(heading), 0.0]))
         tilts = 0.25 * np.array([np.sin(3.1 * u + 0.4), 0.0, np.sin(2.3 * u)])
         return np.asarray(T @ rotation([tilts[0], 0, 0]) @ rotation([0, 0, tilts[2]]), np.float64)
 

@@ -135,8 +135,7 @@ def _noisy(
     # A common factor of a pixel's phase images makes the tails of the range heavy (Student's t with
     # 5 degrees of freedom).
     shape = mean_a.shape[2:]
-    tails = np.sqrt(3 / rng.chisquare(5, shape))
-    gain = _noise_gain(shape) * tails
+    gain = _noise_gain(shape) * np.sqrt(3 / rng.chisquare(5, shape))
     a, b = (
         mean + gain * np.sqrt(mean + read**2) * _correlated_noise(rng, mean.shape)
         for mean in (mean_a, mean_b)
@@ -216,8 +215,7 @@ def reported_amplitude(model: CameraModel, measurement: Measurement) -> Float32:
     """Amplitude image (H, W) in the camera's counts: integers up to 65534, or saturated."""
     amplitude = measurement.amplitude
     if model.amplitude_kind == "range_compensated":
-        light = np.maximum(model.transmission, 1e-6)
-        amplitude = amplitude * measurement.range_m**2 / light
+        amplitude = amplitude * measurement.range_m**2 / np.maximum(model.transmission, 1e-6)
     counts = np.clip(np.round(amplitude), 0, SATURATED_AMPLITUDE - 1)
     return np.where(measurement.saturated, SATURATED_AMPLITUDE, counts).astype(np.float32)
 

@@ -101,8 +101,7 @@ def corner_normals(mesh: Mesh) -> Float64:
     np.add.at(total, corner, weight[:, None] * normals[other])
     length = np.linalg.norm(total, axis=1, keepdims=True)
     face_normal = np.repeat(normals, 3, axis=0)
-    out = np.where(length > 1e-12, unit_vectors(total), face_normal)
-    return out.reshape(-1, 3, 3)
+    return np.where(length > 1e-12, unit_vectors(total), face_normal).reshape(-1, 3, 3)
 
 
 def box(size: ArrayLike, centre: ArrayLike = (0.0, 0.0, 0.0)) -> Mesh:
