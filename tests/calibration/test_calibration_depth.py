@@ -109,8 +109,7 @@ def test_unknown_planes_constrain_all_but_constant_and_scale() -> None:
 
 @pytest.mark.nightly
 def test_unconstrained_constant_is_not_corrected() -> None:
-    far = calibrate_depth(made_views(known=False, constant=0.03), CAMERA)
-    error = curve_error(far, 0.03)
+    error = curve_error(calibrate_depth(made_views(known=False, constant=0.03), CAMERA), 0.03)
     assert rms(bent(error)) < 0.002
     assert abs(error.mean()) > 0.01
 
@@ -169,8 +168,7 @@ def test_board_on_wall_reduces_wiggling_below_2_mm(views: Recording) -> None:
 
 @pytest.mark.nightly
 def test_wall_at_unknown_poses_reduces_wiggling_below_3_mm(views: Recording) -> None:
-    fit = calibrate_depth(*scene_planes(views, 1, 0))
-    assert simulated_error(fit)[0] < 0.003
+    assert simulated_error(calibrate_depth(*scene_planes(views, 1, 0)))[0] < 0.003
 
 
 @pytest.mark.nightly_part
@@ -210,8 +208,7 @@ def test_command_writes_correction_that_is_applied(
 @pytest.mark.nightly
 def test_real_sr4000_from_two_places_is_rejected(shared_data: Path) -> None:
     """Planes are found, but from two places in a corridor they do not determine the curve."""
-    recording = open_recording(shared_data / "sr4000_corridor")
-    found, camera = scene_planes(recording, 4, 0)
+    found, camera = scene_planes(open_recording(shared_data / "sr4000_corridor"), 4, 0)
     assert len(found) >= 16
     ranges = [float(np.median(view.measured_m)) for view in found]
     # The end of the corridor is nearer by 0.3 m from the second place.

@@ -84,8 +84,7 @@ def test_corners_follow_pixel_centre_convention() -> None:
     middle = se3.transform(se3.inverse(place), [[0, -0.0005, 1.5]])[0]
     mean = se3.transform(T, BOARD.points).mean(0)
     assert mean == pytest.approx(middle, abs=0.004)
-    offsets = TRUE.project(middle) - TRUE.project(mean)
-    assert np.abs(offsets).max() < 0.1
+    assert np.abs(TRUE.project(middle) - TRUE.project(mean)).max() < 0.1
 
 
 @pytest.mark.nightly
@@ -112,8 +111,8 @@ def _bare(frame: RangeFrame) -> RangeFrame:
         (lambda: frames()[:3], BOARD, "3 distinct viewpoints"),
         (lambda: frames()[:1] * 6, BOARD, "1 distinct viewpoints"),
         (lambda: frames()[:4], Board(9, 7, 0.1), "shows no board of 9 x 7"),
-        (lambda: frames()[:4], Board(5, 4, 0.1), "check --board"),
-        (lambda: [_bare(frames()[0])], BOARD, "--image color"),
+        (lambda: frames()[:4], Board(5, 4, 0.1), "check board"),
+        (lambda: [_bare(frames()[0])], BOARD, "use image color"),
         (lambda: [CloudFrame.of(np.eye(3))], BOARD, "contains clouds"),
     ],
 )

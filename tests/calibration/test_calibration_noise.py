@@ -123,8 +123,7 @@ def test_confidence_is_used_only_if_informative() -> None:
 
 
 def test_estimate_is_robust_to_flickering_edges() -> None:
-    r = np.broadcast_to(np.linspace(0.5, 4, 80), (60, 80))
-    frames = plain_frames(0.003 * r**2)
+    frames = plain_frames(0.003 * np.broadcast_to(np.linspace(0.5, 4, 80), (60, 80)) ** 2)
     rng = np.random.default_rng(8)
     edge = rng.random((60, 80)) < 0.08
     flicker = [
