@@ -74,8 +74,7 @@ def test_known_motion_is_found(request, scene, options):
 def test_convergence_basin_of_coarse_level(room, size):
     rng = np.random.default_rng(1)
     for _ in range(3):
-        off = size * rng.uniform(-1, 1, 6)
-        start = room.poses[1] @ se3.exp(off)
+        start = room.poses[1] @ se3.exp(size * rng.uniform(-1, 1, 6))
         found = align(room.views[1], [room.target], start, OPTIONS)
         assert_near(found, room.poses[1], 0.002, 0.04)
 
@@ -104,8 +103,7 @@ def test_flat_wall_without_albedo_constrains_three_directions(wall):
     free[2, 3:] = normal
     free /= UNITS
     basis = np.linalg.qr(free.T)[0]
-    overlap = np.linalg.svd(found.unobservable @ basis)[1]
-    assert overlap.min() > 0.98
+    assert np.linalg.svd(found.unobservable @ basis)[1].min() > 0.98
     # They stay as predicted ...
     moved = se3.log(se3.inverse(predicted) @ found.T_world_source) / UNITS
     assert np.abs(found.unobservable @ moved).max() < 0.1
@@ -132,8 +130,7 @@ def test_corridor_does_not_constrain_its_axis():
     pair = Pair("corridor", 0, 6, texture=False)
     found = align(pair.views[1], [pair.target], np.eye(4), GEOMETRY)
     assert len(found.unobservable) == 1
-    along = np.abs(found.unobservable[0] * UNITS)
-    assert np.argmax(along[:3]) == 2
+    assert np.argmax(np.abs(found.unobservable[0] * UNITS)[:3]) == 2
     assert np.abs(found.unobservable[0, 2]) > 0.9
 
 
@@ -213,8 +210,7 @@ def test_empty_view_stays_at_prediction(room):
 def test_view_with_infinite_planes_stays_at_prediction(room):
     planes = room.views[1].planes.copy()
     planes[60:70, :, :3] = np.inf
-    view = replace(room.views[1], planes=planes)
-    found = align(view, [room.target], room.poses[2], OPTIONS)
+    found = align(replace(room.views[1], planes=planes), [room.target], room.poses[2], OPTIONS)
     np.testing.assert_array_equal(found.T_world_source, room.poses[2])
     assert not found.converged
     assert found.inliers == 0

@@ -73,8 +73,7 @@ def corner_errors():
 
 def test_covariance_covers_errors_of_noise(corner_errors):
     ours, _ = corner_errors
-    within = np.mean(np.abs(ours) < 1.96)
-    assert within > 0.88
+    assert np.mean(np.abs(ours) < 1.96) > 0.88
     # Not so wide as to be useless.
     assert np.sqrt(np.mean(ours**2)) > 0.3
 
@@ -160,8 +159,7 @@ def test_uncertainty_is_bounded_by_prediction():
     axes = np.kron(np.eye(2), turned)
     known = axes @ np.diag([1e-6, 1e-5, 1e-4, 1e-6, 1e-5, 1e-4]) @ axes.T
     np.testing.assert_array_equal(bounded_by_prior(known, prior), known)
-    loose = known + 36.0 * np.outer(axes[:, 1], axes[:, 1])
-    cut = bounded_by_prior(loose, prior)
+    cut = bounded_by_prior(known + 36.0 * np.outer(axes[:, 1], axes[:, 1]), prior)
     np.testing.assert_allclose(axes[:, 1] @ cut @ axes[:, 1], 0.09, rtol=1e-4)
     for k in (0, 2, 3, 4, 5):
         np.testing.assert_allclose(axes[:, k] @ cut @ axes[:, k], axes[:, k] @ known @ axes[:, k])
@@ -204,5 +202,4 @@ def test_common_tilts_do_not_constrain_wall():
     assert len(align(source, targets, np.eye(4), fooled).unobservable) < 3
     aligned = align(source, targets, np.eye(4), GEOMETRY_ONLY)
     assert len(aligned.unobservable) == 3
-    found = patches(source, targets, aligned, GEOMETRY_ONLY)
-    assert found.change < 0.01
+    assert patches(source, targets, aligned, GEOMETRY_ONLY).change < 0.01

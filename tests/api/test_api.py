@@ -201,8 +201,7 @@ def test_evaluate_accepts_files_and_arrays(result, arrays, tmp_path):
     recording = tofuse.from_arrays(*arrays[:2], reference=poses)
     assert loaded.evaluate(recording).error.ate_rms_m == pytest.approx(by_array)
     for estimate in (loaded, result.trajectory):  # whose times are those of the recording
-        by_recording = tofuse.evaluate(estimate, recording)
-        assert by_recording.error.ate_rms_m == pytest.approx(by_array)
+        assert tofuse.evaluate(estimate, recording).error.ate_rms_m == pytest.approx(by_array)
     with pytest.raises(tofuse.InputError, match="reference: has no reference poses"):
         loaded.evaluate(tofuse.from_arrays(*arrays[:2]))
 
@@ -250,8 +249,7 @@ def test_from_arrays_accepts_depth_formats(arrays, kind):
         given = [image.tolist() for image in depth]
     else:
         given, camera = depth, tofuse.Pinhole(80, 60, 70, 70, 39.5, 29.5)
-    recording = tofuse.from_arrays(given, camera, **options)
-    frame = recording[1]
+    frame = tofuse.from_arrays(given, camera, **options)[1]
     assert isinstance(frame, RangeFrame)
     np.testing.assert_allclose(frame.depth, depth[1], atol=6e-4)
     assert frame.camera.fx == 70
@@ -346,8 +344,7 @@ def test_inconsistent_arrays_are_rejected(arrays, change, named):
 )
 def test_slow_cameras_and_parts_of_images_are_accepted(arrays, times):
     K = arrays[1] + [[0, 0, 30], [0, 0, 0], [0, 0, 0]]  # as of an image cut at its left
-    recording = tofuse.from_arrays(arrays[0], K, timestamps=times)
-    assert len(recording) == 6
+    assert len(tofuse.from_arrays(arrays[0], K, timestamps=times)) == 6
 
 
 @pytest.mark.parametrize(
@@ -474,8 +471,7 @@ def test_saved_mesh_is_read_by_trimesh(result, tmp_path, suffix):
         np.sort(read.bounds * [1, flip, flip], axis=0), [mine.min(0), mine.max(0)], atol=1e-5
     )
     assert len(read.faces) == len(result.mesh.faces)
-    theirs = result.mesh.to_trimesh()
-    assert read.area == pytest.approx(theirs.area, rel=1e-4)
+    assert read.area == pytest.approx(result.mesh.to_trimesh().area, rel=1e-4)
 
 
 @pytest.mark.parametrize("suffix", ["ply", "pcd", "las", "e57"])

@@ -57,8 +57,7 @@ def write(path: Path, points: np.ndarray) -> Path:
 def register(folder: Path, source: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return the pose in the coordinates of the files, by the documented call on their frames."""
     files = write(folder / "source.xyz", source), write(folder / "target.xyz", target)
-    views = [tofuse.open(file)[0] for file in files]
-    registration = tofuse.register(*views)
+    registration = tofuse.register(*[tofuse.open(file)[0] for file in files])
     assert registration.believed
     return registration.T_target_source
 
@@ -83,8 +82,7 @@ def agree(T: np.ndarray, expected: np.ndarray, at: np.ndarray | float = 0.0) -> 
 )
 def test_translating_both_clouds_translates_pose(tmp_path, pose, shift) -> None:
     shift = np.array(shift, float)
-    T = register(tmp_path, SOURCE + shift, TARGET + shift)
-    agree(T, se3.about(shift, pose), shift)
+    agree(register(tmp_path, SOURCE + shift, TARGET + shift), se3.about(shift, pose), shift)
 
 
 def test_translating_one_cloud_translates_pose(tmp_path, pose) -> None:
@@ -183,8 +181,7 @@ def test_run_keeps_georeference_of_clouds(results, tmp_path) -> None:
     export(results["map"], ["pcd", "las"], tmp_path)
     exported = read_pcd(tmp_path / "cloud.pcd").cloud.points
     np.testing.assert_allclose(exported, written, rtol=0, atol=1e-6)
-    laspy = pytest.importorskip("laspy")
-    las = laspy.read(tmp_path / "cloud.las")
+    las = pytest.importorskip("laspy").read(tmp_path / "cloud.las")
     np.testing.assert_allclose(las.xyz, written, rtol=0, atol=1e-4)
     spans = [np.percentile(points, [5, 95], axis=0) for points in (written - MAP, plain)]
     np.testing.assert_allclose(*spans, rtol=0, atol=0.1)
@@ -221,8 +218,7 @@ def test_loaded_result_is_relative_to_its_shift(results) -> None:
 
 def test_evaluation_of_right_result_in_map_coordinates(results, tmp_path) -> None:
     write_tum(tmp_path / "truth.txt", range(3), se3.about(MAP, POSES))
-    error = tofuse.evaluate(results["map"], tmp_path / "truth.txt").error
-    assert error.ate_rms_m < 0.015
+    assert tofuse.evaluate(results["map"], tmp_path / "truth.txt").error.ate_rms_m < 0.015
 
 
 def test_shift_is_decided_by_the_median() -> None:

@@ -106,8 +106,7 @@ def test_bad_recording_does_not_stop_batch(room_recording: Path, tmp_path: Path,
     assert output.startswith("1 of 2 recordings have a result: ")
     assert f"nothing: {tmp_path / 'nothing'}: doesn't exist" in output
     assert states(out) == {"nothing": "failed", room_recording.name: "done"}
-    page = (out / "batch.html").read_text()
-    assert f'<img src="jobs/{room_recording.name}.jpg"' in page
+    assert f'<img src="jobs/{room_recording.name}.jpg"' in (out / "batch.html").read_text()
     assert (out / "jobs" / f"{room_recording.name}.jpg").read_bytes()[:2] == b"\xff\xd8"
     (made,) = (r for r in records(out) if r["state"] == "done")
     assert made["posed"] == made["frames"] == 2

@@ -44,8 +44,7 @@ def test_projected_rays_give_pixels(camera: Camera) -> None:
     assert rays.dtype == np.float32
     assert not rays.flags.writeable
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
-    points = homogeneous(rays) * 2.5
-    error = np.abs(camera.project(points) - np.stack([u, v], -1))
+    error = np.abs(camera.project(homogeneous(rays) * 2.5) - np.stack([u, v], -1))
     assert np.isfinite(rays).all()
     assert error.max() < 1e-3
 
@@ -85,8 +84,7 @@ def test_fisheye_matches_opencv() -> None:
 
 def test_unreachable_pixels_are_nan() -> None:
     # Strong barrel distortion folds over: no ray reaches the corners of the image.
-    camera = BrownConrady(176, 144, 100.0, 100.0, 87.5, 71.5, -0.5)
-    rays = camera.rays()
+    rays = BrownConrady(176, 144, 100.0, 100.0, 87.5, 71.5, -0.5).rays()
     assert np.isnan(rays[0, 0]).all()
     np.testing.assert_allclose(rays[72, 88], [0.005, 0.005], rtol=1e-3)
 
@@ -129,8 +127,7 @@ def test_ray_table_keeps_rays_and_tolerates_holes() -> None:
 
 
 def test_scaling_keeps_rays_of_block_centres() -> None:
-    half = scaled(PINHOLE, 88, 72)
-    rays, full = half.rays(), PINHOLE.rays()
+    rays, full = scaled(PINHOLE, 88, 72).rays(), PINHOLE.rays()
     blocks = full.reshape(72, 2, 88, 2, 2).mean((1, 3))
     np.testing.assert_allclose(rays, blocks, atol=1e-6)
 

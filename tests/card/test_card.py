@@ -42,8 +42,7 @@ def session(
 ) -> Path:
     """A result of a day that states errors of the camera, 0 but for the focal length."""
     folder.mkdir(parents=True)
-    config = {"corrections": corrections or []}
-    result = made_result(folder, camera, config=config)
+    result = made_result(folder, camera, config={"corrections": corrections or []})
     path = folder / "scan" / "camera.json"
     stated = {"sensor": "ifm O3R (ToF)", "serial": "17"} if about is None else about
     path.write_text(json.dumps(json.loads(path.read_text()) | stated))
@@ -119,8 +118,7 @@ def test_what_a_run_corrected_belongs_to_the_camera(tmp_path: Path) -> None:
     multipath = {"part": "multipath", "strength": [0.3, 0.05]}
     noise = {"part": "noise", "model": {"name": "mine", "range": {"a": 0.001, "b": 0.002}}}
     result = session(tmp_path / "a", 20_000, corrections=[corrected, multipath, noise])
-    other = session(tmp_path / "b", 20_001)
-    first, _ = make_card([result, other]).sessions
+    first, _ = make_card([result, session(tmp_path / "b", 20_001)]).sessions
     assert first.values["focal"][0] == pytest.approx(40 / 1.05, rel=0.005)
     assert first.values["offset"] == (pytest.approx(-0.02, abs=0.008), 0.002)
     assert first.values["multipath"] == (0.3, 0.05)

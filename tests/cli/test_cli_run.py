@@ -120,8 +120,7 @@ def test_run_json_follows_contract(room_result, room_recording) -> None:
         if frame["index"]:
             assert 0 < frame["inlier_share"] <= 1
             assert 0 < frame["rms_m"] < 0.1
-            covariance = np.array(frame["covariance"]).reshape(6, 6)
-            assert (np.linalg.eigvalsh(covariance) > 0).all()
+            assert (np.linalg.eigvalsh(np.array(frame["covariance"]).reshape(6, 6)) > 0).all()
     for values in data["filters"].values():
         assert set(values) == {"removed"}
         assert 0 <= values["removed"] <= 1
@@ -139,8 +138,7 @@ def test_seed_controls_randomness(room_recording, tmp_path) -> None:
     for name, seed in (("a", 5), ("b", 5), ("c", 6)):
         run(room_recording, "--out", tmp_path / name, "--seed", seed, *QUICK)
     assert same(tmp_path / "a") == same(tmp_path / "b")
-    found = {(tmp_path / n / "trajectory.txt").read_bytes() for n in ("b", "c")}
-    assert len(found) == 2
+    assert len({(tmp_path / n / "trajectory.txt").read_bytes() for n in ("b", "c")}) == 2
 
 
 @pytest.mark.nightly_part
@@ -397,8 +395,7 @@ def test_run_is_evaluated(room_result, room_recording, capsys) -> None:
 
 def test_evaluate_says_what_is_not_comparable(room_result, room_recording, tmp_path, capsys):
     rows = np.loadtxt(room_result / "trajectory.txt")
-    poses = tofuse.load(room_result).trajectory
-    np.save(tmp_path / "inverse.npy", np.linalg.inv(poses))
+    np.save(tmp_path / "inverse.npy", np.linalg.inv(tofuse.load(room_result).trajectory))
     np.savetxt(tmp_path / "ms.txt", rows * ([1000] + [1] * 7))
     assert main(["evaluate", str(tmp_path / "inverse.npy"), str(room_recording)]) == 0
     assert "if the estimate or the reference holds T_camera_world" in capsys.readouterr().err
@@ -432,8 +429,7 @@ def test_evaluate_uses_reference_of_recording(room_result, room_recording, tmp_p
 def test_optimize_command_keeps_refined_poses(room_result, tmp_path, capsys) -> None:
     out = tmp_path / "out.g2o"
     assert main(["optimize", str(room_result / "pose_graph.g2o"), "--out", str(out)]) == 0
-    output = capsys.readouterr().out
-    assert re.match(r"8 poses, \d+ edges: squared error", output)
+    assert re.match(r"8 poses, \d+ edges: squared error", capsys.readouterr().out)
     # The edges are those of the refinement, so there is nothing to improve.
     before, after = read_g2o(room_result / "pose_graph.g2o"), read_g2o(out)
     assert after.ids.tolist() == list(range(8))

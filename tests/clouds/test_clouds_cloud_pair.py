@@ -115,8 +115,7 @@ def test_moved_points_have_no_viewpoint(frames, scans):
 
 
 def test_evenly_sampled_surfaces_have_no_viewpoint(frames):
-    even = averaged(CloudFrame.of(frames[0].points), 0.08)
-    assert viewpoint_of(even) is None
+    assert viewpoint_of(averaged(CloudFrame.of(frames[0].points), 0.08)) is None
     assert viewpoint_of(CloudFrame.of(np.zeros((100, 3)))) is None
     assert viewpoint_of(CloudFrame.of(frames[0].points[:20])) is None
 
@@ -236,8 +235,7 @@ def test_flying_pixels_do_not_contradict_correct_pose():
     seen = se3.transform(true, source[mixed].astype(float))
     assert np.mean(views[1].sphere.distance_in_front(seen) > 0.1) > 0.1
     # Surfaces do contradict a wrong pose.
-    wrong = cloud_agreement(*views, se3.exp([0.15, 0, -0.4, 0, 0, 0]))
-    assert wrong.contradiction > 0.05
+    assert cloud_agreement(*views, se3.exp([0.15, 0, -0.4, 0, 0, 0])).contradiction > 0.05
 
 
 def test_agreement_is_symmetric(scans):
@@ -370,8 +368,7 @@ def test_fused_clips_that_overlap_little_are_registered(clips, moved):
     source, target, true = clips
     if moved:
         source, true = se3.transform(ANYWHERE, source), true @ se3.inverse(ANYWHERE)
-    found = tofuse.register(source, target)
-    shift, angle = pose_error(found.T_target_source, true, source)
+    shift, angle = pose_error(tofuse.register(source, target).T_target_source, true, source)
     assert shift < 0.05
     assert angle < 2
 
@@ -479,8 +476,7 @@ def test_result_is_independent_of_threads(scans, registered):
 def test_degenerate_clouds_are_not_accepted():
     rng = np.random.default_rng(0)
     plane = rng.uniform(-1, 1, (3000, 3)) * [1, 1, 0] + [0, 0, 2]
-    ten = rng.normal(size=(10, 3))
-    for points in (plane, ten):
+    for points in (plane, rng.normal(size=(10, 3))):
         found = tofuse.register(points, points)
         assert found.believed is False
         assert "3 directions are degenerate" in found.reason
@@ -584,16 +580,14 @@ def test_pose_that_all_first_proposals_lead_to_is_compared_with_others(seed):
 def test_candidates_of_same_pose_are_not_rivals():
     """With large noise, iterations stop slightly apart; such poses do not contradict each other."""
     views, _ = peaks_views(0.1, 101)
-    found = register_clouds(views[1], views[0], None, np.random.default_rng(0))
-    assert found.probability > 0.5
+    assert register_clouds(views[1], views[0], None, np.random.default_rng(0)).probability > 0.5
 
 
 def test_pose_contradicted_by_assumed_free_space_is_not_accepted(monkeypatch) -> None:
     """Either the pose is wrong, or the cloud was not seen from its origin."""
     found = Registration(np.eye(4), True, 1, 1, 1, 0.0, 0.0, np.eye(6), believed=False)
     with_free_space = replace(found, probability=0.4)
-    without = replace(found, believed=True, probability=0.95)
-    blind = SimpleNamespace(registration=without)
+    blind = SimpleNamespace(registration=replace(found, believed=True, probability=0.95))
     views = SimpleNamespace(
         registration=with_free_space, has_assumed_viewpoint=True, without_free_space=lambda: blind
     )

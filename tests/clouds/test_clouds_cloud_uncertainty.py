@@ -78,8 +78,7 @@ def test_wall_constrains_three_directions():
 
 def test_clouds_without_overlap_have_no_information():
     cloud = view(bumpy_ball(2000, 0))
-    away = CloudFrame.of(cloud.points + np.array([30.0, 0, 0]))
-    source, target = maps(cloud, away)
+    source, target = maps(cloud, CloudFrame.of(cloud.points + np.array([30.0, 0, 0])))
     assert len(cloud_unobservable(source, target, np.eye(4))) == 6
     free = np.zeros((0, 6))
     assert np.diag(cloud_information(source, target, np.eye(4), free)).max() < 1e-2

@@ -89,6 +89,5 @@ def test_symmetries_are_found_once():
     view = CloudFrame.of(rng(1).permutation(points))
     found = symmetries(view)
     assert symmetries(view) is found
-    angles = np.degrees(se3.angle(found))
-    assert np.abs(angles - 72).min() < 1.5  # no half or quarter turn
+    assert np.abs(np.degrees(se3.angle(found)) - 72).min() < 1.5  # no half or quarter turn
     assert len(symmetries(CloudFrame.of(stone(3000, 0)))) == 0

@@ -52,8 +52,7 @@ def test_hidden_and_distant_surfaces_are_not_seen() -> None:
 
 
 def test_scales_are_those_of_the_measured_pairs() -> None:
-    rng = np.random.default_rng(2)
-    J = rng.normal(size=(9, 2, 8, 6))
+    J = np.random.default_rng(2).normal(size=(9, 2, 8, 6))
     predicted = np.swapaxes(J, 2, 3) @ J
     measured = 300 * predicted[:, 0] + 20 * predicted[:, 1]
     measured[0] *= 50  # an outlier

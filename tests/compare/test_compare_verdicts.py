@@ -49,8 +49,7 @@ def test_distances_are_exact_and_signed(part) -> None:
     np.testing.assert_allclose(found.signed, heights, atol=1e-9)
     # Another side of the body, or nothing beside the border.
     assert not surface.distances(points, -up, reach).compared.any()
-    beside = points + np.array([0.2, 0, 0.005])
-    assert not surface.distances(beside, up, reach).compared.any()
+    assert not surface.distances(points + np.array([0.2, 0, 0.005]), up, reach).compared.any()
 
 
 def test_distances_are_those_of_an_unlimited_search(part, monkeypatch) -> None:
@@ -216,8 +215,7 @@ def test_a_room_faces_inwards(part) -> None:
     """It is closed as a solid is, whose faces would be inside out."""
     room = Reference.of(replace(part.surface, faces=part.surface.faces[:, ::-1]))
     outside = scan(part, bump=0.006)
-    inside = replace(outside, normals=-outside.normals)
-    found = compared(inside, room, 0.002, searched=False)
+    found = compared(replace(outside, normals=-outside.normals), room, 0.002, searched=False)
     worst = max(found.worst, key=lambda row: abs(row["deviation_m"]))
     assert worst["deviation_m"] < -0.004
     assert found.to_dict()["without_counterpart"] < 0.05

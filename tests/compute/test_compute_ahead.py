@@ -49,8 +49,7 @@ def test_run_uses_listed_signatures(room_recording: Path) -> None:
         """
     )
     words = [sys.executable, "-c", program, str(room_recording)]
-    done = subprocess.run(words, check=True, capture_output=True, text=True)
-    called = done.stdout.split()
+    called = subprocess.run(words, check=True, capture_output=True, text=True).stdout.split()
     for name in (
         "engine.alignment.step_kernels.iterate_level",
         "engine.views.view_planes_kernels.fit_planes",

@@ -79,8 +79,7 @@ def test_least_recently_used_item_is_spilled_first(tmp_path: Path) -> None:
 def test_arrays_are_made_contiguous_on_put() -> None:
     spill: Spill[Item] = Spill(10**9)
     whole = np.arange(600.0).reshape(20, 30)
-    number = spill.put(Item(0, _RAYS, whole[:, ::3], whole.T))
-    got = spill.get(number)
+    got = spill.get(spill.put(Item(0, _RAYS, whole[:, ::3], whole.T)))
     assert got.image.flags.c_contiguous
     assert got.mask is not None
     assert got.mask.flags.c_contiguous

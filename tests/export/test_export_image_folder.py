@@ -79,8 +79,7 @@ def test_nerfstudio_depth_and_poses_reproduce_points(tmp_path: Path, camera: Cam
         assert (sigma[~seen] == 0).all()
         assert np.median(sigma) * data["sigma_unit_scale_factor"] < 0.05
         image = cv2.imread(str(folder / frame["file_path"]))[..., ::-1]
-        mask = image.any(-1)
-        assert (image[mask][:, 0] == 10 + k).all()
+        assert (image[image.any(-1)][:, 0] == 10 + k).all()
         assert frame["timestamp"] == pytest.approx(0.1 * k)
         covariance = frame.get("pose_covariance")
         assert (covariance is None) == (k == 1)
@@ -99,8 +98,7 @@ def test_nerfstudio_depth_and_poses_reproduce_points(tmp_path: Path, camera: Cam
 
 def test_colmap_text_files(tmp_path: Path) -> None:
     """The text files, for machines without pycolmap."""
-    result = made_result(tmp_path, BROWN)
-    (folder,) = export(result, ["colmap"], every=2)
+    (folder,) = export(made_result(tmp_path, BROWN), ["colmap"], every=2)
     text = (folder / "sparse" / "0" / "cameras.txt").read_text().splitlines()[1]
     assert text == "1 OPENCV 48 36 40.0 41.0 23.5 18.5 -0.1 0.02 0.002 -0.001"
     lines = (folder / "sparse" / "0" / "images.txt").read_text().split("\n")

@@ -25,8 +25,7 @@ NORMAL, DISTANCE = np.array([0.2, -0.1, 0.97]), 1.8
 def plane_depth(camera: object) -> np.ndarray:
     """z of a tilted plane at each pixel."""
     rays = camera.rays().astype(float)
-    slope = rays @ NORMAL[:2] + NORMAL[2]
-    z = DISTANCE / slope
+    z = DISTANCE / (rays @ NORMAL[:2] + NORMAL[2])
     return np.where(np.isfinite(z) & (z > 0) & (z < 20), z, 0).astype(np.float32)
 
 
@@ -106,8 +105,7 @@ def test_open3d_is_read_back(tmp_path: Path) -> None:
     back = tofuse.open(tmp_path / "out")
     assert back.format == "redwood"
     frame = back[3]
-    expected = Rectifier(pinhole_of(BARREL))(recording[3])
-    assert np.abs(frame.z - expected.z).max() < 6e-4
+    assert np.abs(frame.z - Rectifier(pinhole_of(BARREL))(recording[3]).z).max() < 6e-4
     assert frame.camera == pinhole_of(BARREL)
     assert np.diff(back.timestamps) == pytest.approx(0.1, abs=1e-5)
     assert np.allclose(back.reference[3][:3, 3], [0.3, 0, 0])

@@ -71,8 +71,7 @@ def expected(result: Path) -> SimpleNamespace:
 
 
 def test_ply_read_by_trimesh(result: Path, expected) -> None:
-    trimesh = pytest.importorskip("trimesh")
-    mesh = trimesh.load(result / "mesh.ply", process=False)
+    mesh = pytest.importorskip("trimesh").load(result / "mesh.ply", process=False)
     np.testing.assert_array_equal(mesh.vertices, expected.points)
     np.testing.assert_array_equal(mesh.faces, expected.faces)
     np.testing.assert_array_equal(mesh.visual.vertex_colors[:, :3], expected.color)
@@ -238,8 +237,7 @@ def test_laz_is_reproducible_and_written_in_blocks(result: Path, monkeypatch) ->
 
 def test_kitti(result: Path) -> None:
     (path,) = export(result, ["kitti"])
-    rows = np.loadtxt(path)
-    np.testing.assert_allclose(rows.reshape(3, 3, 4), POSES[:, :3], atol=1e-15)
+    np.testing.assert_allclose(np.loadtxt(path).reshape(3, 3, 4), POSES[:, :3], atol=1e-15)
 
 
 def test_export_command(result: Path, tmp_path: Path, capsys) -> None:
@@ -260,8 +258,7 @@ def test_export_command(result: Path, tmp_path: Path, capsys) -> None:
     (out / "mine.txt").write_text("mine")
     kept = sorted(out.iterdir())
     for folder in (tmp_path / "fresh", out):  # the cloud comes first
-        words = ["export", str(result), "pcd", "log", "stl", "--out", str(folder)]
-        assert main(words) == 2
+        assert main(["export", str(result), "pcd", "log", "stl", "--out", str(folder)]) == 2
         assert "mesh.ply: doesn't exist" in capsys.readouterr().err
     assert not (tmp_path / "fresh").exists()
     assert sorted(out.iterdir()) == kept

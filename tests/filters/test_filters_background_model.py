@@ -44,8 +44,7 @@ def recording(
     frames, masks = [], []
     for k in range(count):
         z, mask = turning_box(2 * np.pi * k / count * 0.93, background)
-        noisy = z + rng.normal(0, sigma, z.shape)
-        frames.append(frame(np.where(z > 0, noisy, 0), k))
+        frames.append(frame(np.where(z > 0, z + rng.normal(0, sigma, z.shape), 0), k))
         masks.append(mask)
     return frames, masks
 
@@ -101,8 +100,7 @@ def test_object_includes_pixels_it_always_hides() -> None:
 
 def test_static_objects_in_front_are_background() -> None:
     # A shelf as near as the object, at the left border, and a floor that extends to near range.
-    shelf = np.where(U < 14, 1.1, np.where(V > 52, 1.6, 3.0))
-    frames, masks = recording(background=shelf)
+    frames, masks = recording(background=np.where(U < 14, 1.1, np.where(V > 52, 1.6, 3.0)))
     found = moving_object(frames)
     assert not found.always_occluded[:, :14].any()
     assert not found.always_occluded[53:].any()

@@ -36,8 +36,7 @@ def test_confidence_level_is_rescaled(highest: int, level: int) -> None:
 
 def test_distance_distinguishes_z_and_range() -> None:
     # 3-4-5: the second pixel looks along (0.75, 0, 1), so z = 4 lies at a range of 5.
-    camera = Pinhole(2, 2, 1 / 0.75, 1.0, 0.0, 0.0)
-    f = RangeFrame(0, 0.0, camera, np.float32([[4, 4], [0, 9]]))
+    f = RangeFrame(0, 0.0, Pinhole(2, 2, 1 / 0.75, 1.0, 0.0, 0.0), np.float32([[4, 4], [0, 9]]))
     assert Distance(3.9, 4.1).mask(f, ()).tolist() == [[True, True], [False, False]]
     assert Distance(3.9, 4.1, "range").mask(f, ()).tolist() == [[True, False], [False, False]]
     assert Distance(4.9, 5.1, "range").mask(f, ()).tolist() == [[False, True], [False, False]]

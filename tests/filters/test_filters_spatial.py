@@ -48,8 +48,7 @@ def test_angle_agrees_with_equation_2_6() -> None:
     rng = np.random.default_rng(0)
     obtuse = 0
     for _ in range(200):
-        z = rng.uniform(0.5, 5, 2)
-        f = line(z, focal=float(rng.uniform(1, 50)))
+        f = line(rng.uniform(0.5, 5, 2), focal=float(rng.uniform(1, 50)))
         p, n = f.point_image[0].astype(float)
         phi = math.acos(p @ n / np.linalg.norm(p) / np.linalg.norm(n))
         sine = np.linalg.norm(n) / np.linalg.norm(n - p) * math.sin(phi)
@@ -135,8 +134,7 @@ def test_neighbour_distance_is_invariant_to_order_and_frame(seed: int, n: int, k
     order = rng.permutation(n)
     distance = mean_neighbour_distance(points, k)
     assert np.array_equal(mean_neighbour_distance(points[order], k), distance[order])
-    T = se3.exp(rng.uniform(-2, 2, 6))
-    moved = se3.transform(T, points).astype(np.float32)
+    moved = se3.transform(se3.exp(rng.uniform(-2, 2, 6)), points).astype(np.float32)
     assert mean_neighbour_distance(moved, k) == pytest.approx(distance, abs=2e-6)
     share = NeighbourFraction(0.4, k)
     keep = share.mask(CloudFrame.of(points), ())

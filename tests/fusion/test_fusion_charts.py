@@ -67,8 +67,7 @@ def test_unseen_surface_is_neutral_and_no_fringe_is_painted() -> None:
     color = frame.color_image.copy()
     color[:, :30] = 0  # the colour camera did not see it
     color[:, 30:32] = [255, 0, 255]  # a fringe beside it
-    view = TextureView.of(replace(frame, color_image=color))
-    made = textured(mesh, [view], POSES[:1], 512)
+    made = textured(mesh, [TextureView.of(replace(frame, color_image=color))], POSES[:1], 512)
     shown = made.charts.color.astype(int)
     x = mesh.vertices[made.atlas.vertices, 0]
     assert (np.abs(shown[x < -0.45] - NO_COLOR[0]) <= 1).all()
@@ -83,16 +82,14 @@ def test_unseen_surface_is_neutral_and_no_fringe_is_painted() -> None:
 def test_seam_between_images_of_unequal_exposure_is_invisible() -> None:
     mesh = sheet(49, 33, 0.025)
     frames = [look(T, g) for T, g in zip(POSES, (0.8, 1.25, 1.0), strict=True)]
-    made = textured(mesh, [TextureView.of(f) for f in frames], POSES, 1024)
-    used = made.charts
+    used = textured(mesh, [TextureView.of(f) for f in frames], POSES, 1024).charts
     truth = pattern(used.vertices) * np.exp(np.log([0.8, 1.25, 1.0]).mean())
     inside = (np.abs(used.vertices[:, :2]) < [0.5, 0.3]).all(1)
     assert np.abs(used.color[inside] - truth[inside]).max() < 8
 
 
 def test_files_with_texture_are_read_back(tmp_path) -> None:
-    mesh = sheet(9, 7, 0.1)
-    made = textured(mesh, [TextureView.of(look(np.eye(4), 1.0))], POSES[:1], 256)
+    made = textured(sheet(9, 7, 0.1), [TextureView.of(look(np.eye(4), 1.0))], POSES[:1], 256)
     used = made.charts
     record = GeometryRecord(
         used.vertices, used.faces, used.normals, uv=made.atlas.uv, texture=jpeg_bytes(made.image)

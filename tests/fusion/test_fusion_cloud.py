@@ -36,8 +36,7 @@ def plane(rng, n=2000, z=2.0):
 
 def test_voxel_averages_views_with_equal_weight() -> None:
     first = view([[0.01, 0.02, 1.01], [0.03, 0.02, 1.03], [0.55, 0.05, 1.05]])
-    second = view([[0.06, 0.06, 1.06]], 1)
-    found = fuse([first, second])
+    found = fuse([first, view([[0.06, 0.06, 1.06]], 1)])
     assert len(found) == 2
     # Two points of the first view count as one, at their mean.
     np.testing.assert_allclose(found.points[0], [0.04, 0.04, 1.04], atol=1e-6)
@@ -49,8 +48,7 @@ def test_voxel_averages_views_with_equal_weight() -> None:
 def test_black_is_ignored_as_colour() -> None:
     points = np.array([[0.05, 0.05, 1.05], [0.55, 0.05, 1.05]], np.float32)
     seen = view(points, color=np.array([[10, 20, 30], [0, 0, 0]], np.uint8))
-    dark = view(points, 1, color=np.zeros((2, 3), np.uint8))
-    found = fuse([seen, dark])
+    found = fuse([seen, view(points, 1, color=np.zeros((2, 3), np.uint8))])
     assert found.color is not None
     np.testing.assert_array_equal(found.color, [[10, 20, 30], [128, 128, 128]])
 

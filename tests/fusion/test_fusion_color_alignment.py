@@ -75,8 +75,7 @@ def test_alignment_brings_back_perturbed_poses() -> None:
 
 def test_texture_of_perturbed_poses_is_as_sharp_as_of_true_ones() -> None:
     def error(poses: np.ndarray) -> float:
-        made = textured(WALL, views([1.0] * 6), poses, 1024)
-        charts = made.charts
+        charts = textured(WALL, views([1.0] * 6), poses, 1024).charts
         inner = (np.abs(charts.vertices[:, :2]) < [0.6, 0.4]).all(1)
         truth = light(charts.vertices.astype(float))
         return float(np.abs(charts.color[inner, 0] - truth[inner]).mean())

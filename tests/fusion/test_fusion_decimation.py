@@ -59,8 +59,7 @@ def off(whole: Mesh, small: Mesh) -> float:
     """Mean distance of either surface from the other, m."""
     one, other = (Surface(m.vertices.astype(float), m.faces) for m in (whole, small))
     there = distances(one.samples(40_000)[0], other, 100_000)
-    back = distances(other.samples(40_000)[0], one, 100_000)
-    return float(there.mean() + back.mean()) / 2
+    return float(there.mean() + distances(other.samples(40_000)[0], one, 100_000).mean()) / 2
 
 
 def turned_away(whole: Mesh, small: Mesh) -> float:
@@ -93,8 +92,7 @@ def test_attributes_are_means_of_merged_vertices() -> None:
     smooth = np.abs(small.vertices[:, 0]) > 0.2
     cosine = np.einsum("ni,ni->n", small.normals, whole.normals[nearest])
     assert cosine[smooth].min() > 0.85
-    difference = np.abs(small.color.astype(int) - whole.color[nearest])
-    assert difference.mean() < 4
+    assert np.abs(small.color.astype(int) - whole.color[nearest]).mean() < 4
     for name in ("color", "sigma", "views"):
         given, kept = getattr(whole, name), getattr(small, name)
         assert (kept.min(0) >= given.min(0)).all()

@@ -73,8 +73,7 @@ def test_unconstrained_pose_gives_large_sigma() -> None:
 
 def test_unseen_model_is_unchanged() -> None:
     model = model_of(-wall().points)
-    same = with_pose_errors(model, [wall()], np.eye(4)[None], covariance(0.1)[None])
-    assert same is model
+    assert with_pose_errors(model, [wall()], np.eye(4)[None], covariance(0.1)[None]) is model
     assert with_pose_errors(model, [], np.zeros((0, 4, 4)), np.zeros((0, 6, 6))) is model
 
 

@@ -56,8 +56,7 @@ def test_regions_give_same_bytes(room, memory_mb, least) -> None:
 def test_round_robin_colours_and_two_cameras_make_no_seam() -> None:
     """Round-robin depends on the numbers of blocks and views, not on how they are grouped."""
     frames, poses = around_a_ball(70, noise=np.random.default_rng(3))
-    rng = np.random.default_rng(4)
-    color = rng.integers(0, 255, (72, 88, 3)).astype(np.uint8)
+    color = np.random.default_rng(4).integers(0, 255, (72, 88, 3)).astype(np.uint8)
     other = replace(CAMERA, fx=93.0)
     frames = [
         replace(f, camera=other if k % 40 > 25 else CAMERA, color_image=None if k % 9 else color)

@@ -78,8 +78,7 @@ POSES = np.stack(
 
 
 def test_triangles_are_rasterized_in_place() -> None:
-    rng = np.random.default_rng(0)
-    corners = rng.uniform(-3, 33, (12, 3, 2)).astype(np.float32)
+    corners = np.random.default_rng(0).uniform(-3, 33, (12, 3, 2)).astype(np.float32)
     owner = np.full((30, 30), NO_TRIANGLE, np.int32)
     places = np.zeros((30, 30, 2), np.float32)
     draw_triangles(corners, 1.4, owner, places)
@@ -206,8 +205,7 @@ def test_missing_colour_does_not_darken(tmp_path) -> None:
     wall = replace(wall, color=np.where(dark[:, None], 0, [180, 180, 180]).astype(np.uint8))
     small = wall.decimated(400)
     assert set(np.unique(small.color).tolist()) == {0, 180}
-    shown = baked(wall, 400, 256).image
-    assert set(np.unique(shown).tolist()) == {NO_COLOR[0], 180}
+    assert set(np.unique(baked(wall, 400, 256).image).tolist()) == {NO_COLOR[0], 180}
     small.save(tmp_path / "shown.glb")
     document, arrays = parse(tmp_path / "shown.glb")
     colors = arrays[document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
@@ -229,8 +227,7 @@ def test_decimation_keeps_edges_sharp_and_sides_separate() -> None:
     small = ledge.decimated(700)
     assert 200 < len(small.faces) <= 700
     p = small.vertices.astype(float) - 0.0037
-    off = np.minimum(np.abs(p[:, 2] - 2.0), np.abs(p[:, 1] + 0.2))
-    assert off.max() < 0.002
+    assert np.minimum(np.abs(p[:, 2] - 2.0), np.abs(p[:, 1] + 0.2)).max() < 0.002
     assert ledge.decimated(10**6) is ledge
     # A board 1 cm thick, seen from both sides: cells of 5 cm do not merge its sides.
     back = sheet(41, 41, 0.01, 2.01)

@@ -40,8 +40,7 @@ def edges_of(faces):
 def test_exact_zero_level_is_closed_across_blocks() -> None:
     frames, poses = around_a_ball()
     volume = volume_around([RangeView.of(f) for f in frames], poses, 0.012)
-    r = np.linalg.norm(voxels_of(volume), axis=-1)
-    volume.distance[:] = r - 0.3
+    volume.distance[:] = np.linalg.norm(voxels_of(volume), axis=-1) - 0.3
     volume.weight[:] = 1e6
     volume.seen[:] = 1
     mesh = volume.surface()
@@ -157,8 +156,7 @@ def test_blocks_lie_near_surfaces_for_any_number_of_views(ball) -> None:
     np.testing.assert_array_equal(once.keys, twice.keys)
     assert (np.diff(once.keys) > 0).all()
     corners = np.array([[(k >> s & 0x1FFFFF) - (1 << 20) for s in (42, 21, 0)] for k in once.keys])
-    centre = (corners + 0.5) * 8 * 0.012
-    off = np.abs(np.linalg.norm(centre, axis=1) - 0.3)
+    off = np.abs(np.linalg.norm((corners + 0.5) * 8 * 0.012, axis=1) - 0.3)
     assert off.max() < once.reach_m + 0.02 + np.sqrt(3) * 4 * 0.012
 
 
@@ -216,16 +214,14 @@ def test_surfaces_end_at_depth_jumps() -> None:
         # Denoised by the plane fit, as the others are: the noise was 5 mm.
         assert np.std(view.z[10:60, beside] * view.unit - wall) < 0.0035
     assert (weight[:, 10:36] > 0.5 * middle).mean() > 0.98
-    mesh = fuse_surface([view], EYE[None], Fusion(voxel_m=0.03, island=0))
-    z = mesh.vertices[:, 2]
+    z = fuse_surface([view], EYE[None], Fusion(voxel_m=0.03, island=0)).vertices[:, 2]
     assert (np.minimum(np.abs(z - 1), np.abs(z - 2)) < 0.01).all()
 
 
 @pytest.mark.parametrize("sigma", [0.002, 0.01, 0.03])
 def test_weights_reflect_residual_noise(sigma) -> None:
     straight = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
-    rng = np.random.default_rng(6)
-    view = RangeView.of(frame_of(straight, sigma=sigma, noise=rng))
+    view = RangeView.of(frame_of(straight, sigma=sigma, noise=np.random.default_rng(6)))
     off = view.z[5:-5, 5:-5] * view.unit - 2.0
     pixels = pixels_of(view)[5:-5, 5:-5].astype(float)
     lengths = np.linalg.norm(np.insert(CAMERA.rays(), 2, 1, -1), axis=-1)[5:-5, 5:-5]
@@ -273,13 +269,11 @@ def test_large_images_are_stored_at_half_resolution() -> None:
     assert view.nbytes <= 10 * 240 * 320
     assert view.intensity[100, 100].tolist() == [90, 90, 90]
     assert (view.z[100:, 150:] == 0).all()
-    mesh = fuse_surface([view], EYE[None])
-    assert np.abs(mesh.vertices[:, 2] - 2).max() < 0.002
+    assert np.abs(fuse_surface([view], EYE[None]).vertices[:, 2] - 2).max() < 0.002
 
 
 def test_empty_views_make_empty_mesh() -> None:
-    empty = RangeView.of(frame_of(np.full((72, 88), np.inf)))
-    mesh = fuse_surface([empty], EYE[None])
+    mesh = fuse_surface([RangeView.of(frame_of(np.full((72, 88), np.inf)))], EYE[None])
     assert (len(mesh), len(mesh.faces)) == (0, 0)
     assert mesh.cloud().points.shape == (0, 3)
 
@@ -316,8 +310,7 @@ def test_builder_keeps_views_within_memory_limit() -> None:
 
 
 def test_camera_errors_are_corrected_in_images_as_in_points() -> None:
-    rng = np.random.default_rng(5)
-    frame = frame_of(rng.uniform(1, 3, (72, 88)))
+    frame = frame_of(np.random.default_rng(5).uniform(1, 3, (72, 88)))
     errors = {"offset": 0.03, "scale": -0.01, "focal": 0.02}
     view = RangeView.of(frame)
     correction = CameraCorrection(errors)
@@ -430,5 +423,4 @@ def test_round_robin_views_make_accurate_surface() -> None:
     r = np.linalg.norm(mesh.vertices.astype(float), axis=1)
     assert np.abs(r - 0.3).mean() < 0.0015
     assert np.abs(r - 0.3).max() < 0.03
-    area = 4 * np.pi * 0.3**2
-    assert len(mesh) == pytest.approx(1.5 * area / 0.012**2, rel=0.1)
+    assert len(mesh) == pytest.approx(1.5 * (4 * np.pi * 0.3**2) / 0.012**2, rel=0.1)

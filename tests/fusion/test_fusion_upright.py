@@ -124,5 +124,4 @@ def test_up_of_phone_recording_matches_gravity(shared_data: Path, name: str) -> 
         normals.append((n[good] / length[good, None]) @ T[:3, :3].T)
         poses.append(T)
     model = surface(np.concatenate(points), np.concatenate(normals))
-    up = likely_up(model, np.array(poses))
-    assert up[1] > np.cos(np.radians(5))
+    assert likely_up(model, np.array(poses))[1] > np.cos(np.radians(5))

@@ -11,8 +11,7 @@ from tofuse.formats.geometry.glb import write_glb
 
 
 def test_mesh_round_trips(tmp_path) -> None:
-    rng = np.random.default_rng(0)
-    points = rng.normal(size=(7, 3)).astype(np.float32)
+    points = np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32)
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
     color = np.array([[0, 127, 255]] * 7, np.uint8)
     faces = np.array([[0, 1, 2], [2, 3, 6], [4, 5, 0]])

@@ -46,8 +46,7 @@ def test_amplitude_column_aliases() -> None:
         assert amplitude is not None
         assert amplitude.dtype == np.float32
         np.testing.assert_array_equal(amplitude, column)
-    table = np.zeros((3, 2))
-    assert GeometryRecord(POINTS, scalars={"intensity": table}).amplitude is None
+    assert GeometryRecord(POINTS, scalars={"intensity": np.zeros((3, 2))}).amplitude is None
 
 
 def test_obj_that_fails_leaves_the_earlier_texture(tmp_path: Path) -> None:

@@ -80,8 +80,7 @@ def test_result_minimises_literal_objective():
     for _ in range(200):
         xi = rng.normal(size=(12, 6)) * 10 ** rng.uniform(-4, -1)
         xi[0] = 0
-        moved = optimised.with_poses(optimised.poses @ se3.exp(xi))
-        assert literal_objective(moved) > best
+        assert literal_objective(optimised.with_poses(optimised.poses @ se3.exp(xi))) > best
 
 
 def test_objective_is_logged_and_never_rises():
@@ -120,8 +119,7 @@ def test_rotation_only_or_static_camera_is_handled():
 
 
 def test_benchmark_graph_is_optimised(shared_data):
-    graph = read_g2o(shared_data / "pose_graphs" / "parking-garage.g2o")
-    result = Castellani().optimise(graph)
+    result = Castellani().optimise(read_g2o(shared_data / "pose_graphs" / "parking-garage.g2o"))
     assert result.converged
     assert result.objective[-1] < 2e-4 * result.objective[0]
     # The squared error weighted by the information, which the optimiser does not use,

@@ -65,8 +65,7 @@ def dense(graph: PoseGraph, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     A = np.concatenate(rows_t + rows_R)
     M = A.T @ A
     Q = M[n:, n:] - M[n:, :n] @ np.linalg.pinv(M[:n, :n]) @ M[:n, n:]
-    Rt = np.concatenate(list(np.swapaxes(poses[:, :3, :3], 1, 2)))
-    product = Q @ Rt
+    product = Q @ np.concatenate(list(np.swapaxes(poses[:, :3, :3], 1, 2)))
     S = Q.copy()
     multipliers = np.zeros((n, 3, 3))
     for k in range(n):
@@ -151,8 +150,7 @@ def test_isotropic_weights_are_below_information() -> None:
 def test_anisotropic_information_leaves_weaker_statement() -> None:
     graph = random_graph(3)
     squeezed = graph.information * np.outer([1, 1, 10, 1, 1, 1], [1, 1, 10, 1, 1, 1])
-    solved = BEST.optimise(replace(graph, information=squeezed)).graph
-    found = certify(solved)
+    found = certify(BEST.optimise(replace(graph, information=squeezed)).graph)
     assert not found.optimal
     assert 0 < found.lower_bound < found.squared_error
     assert found.isotropic

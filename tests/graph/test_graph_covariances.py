@@ -85,8 +85,7 @@ def test_loops_between_parts_without_odometry_have_no_error() -> None:
 
 def test_disconnected_parts_have_no_covariance() -> None:
     steps = [Measured(k, k + 1, STEP, np.eye(6)) for k in (0, 1, 3, 4)]
-    graph = build_graph(range(6), TRUE[:6], steps)
-    C = GraphCovariances(graph).of_poses
+    C = GraphCovariances(build_graph(range(6), TRUE[:6], steps)).of_poses
     assert np.isfinite(C[:3]).all()
     assert np.isnan(C[3:]).all()
     one = build_graph([7], TRUE[:1], [])
@@ -120,8 +119,7 @@ def test_relative_covariance_of_chain_is_that_of_edges_between() -> None:
     assert np.linalg.eigvalsh(far - np.diag(sigmas[5] ** 2)).min() > 0
     assert not relative_covariance(np.eye(4), np.full((6, 6), np.nan), C[3]).any()
     # An uncertain branch does not give an indefinite covariance.
-    branch = relative_covariance(np.eye(4), C[6], C[1])
-    assert np.linalg.eigvalsh(branch).min() > -1e-15
+    assert np.linalg.eigvalsh(relative_covariance(np.eye(4), C[6], C[1])).min() > -1e-15
 
 
 def with_branches(graph: PoseGraph) -> PoseGraph:

@@ -110,8 +110,7 @@ def test_gravity_removes_roll_and_pitch_drift():
     assert tilt(corrected, right) < 0.4 * tilt(graph.poses, right)
     np.testing.assert_array_equal(corrected[0], graph.poses[0])
     assert measured.records[0].used == N
-    up = measured.up(graph.with_poses(corrected))
-    assert np.degrees(np.arccos(up @ -DOWN)) < 1.0
+    assert np.degrees(np.arccos(measured.up(graph.with_poses(corrected)) @ -DOWN)) < 1.0
     assert SensorPriors().up(graph) is None
     # Gravity does not constrain heading or position.
     C, free = (
@@ -186,8 +185,7 @@ def test_good_odometry_helps_and_wrong_odometry_is_rejected():
 def test_odometry_is_weighted_by_its_actual_errors():
     """Several times the stated noise: it is weighted accordingly, and does no harm."""
     right, graph = walked(0 * NODDING)
-    noisy = odometer(right, 0.04)
-    measured = measure_all((OdometryEdges(),), sensed(noisy), graph)
+    measured = measure_all((OdometryEdges(),), sensed(odometer(right, 0.04)), graph)
     record = measured.records[0]
     assert record.scale is not None
     assert 1.5 < record.scale < 5
@@ -209,8 +207,7 @@ def test_odometry_errors_are_estimated_from_constrained_motion():
     right, graph = walked(0 * NODDING)
     wall = (np.arange(N) >= 10) & (np.arange(N) < 48)
     measurements = graph.measurements.copy()
-    slide = wall[graph.edges[:, 1]]
-    measurements[slide] = np.eye(4)
+    measurements[wall[graph.edges[:, 1]]] = np.eye(4)
     poses = np.stack([*itertools.accumulate([graph.poses[0], *measurements], np.matmul)])
     wrong = replace(graph, measurements=measurements).with_poses(poses)
     measured = measure_all((OdometryEdges(),), sensed(odometer(right), degenerate=wall), wrong)
@@ -276,8 +273,7 @@ def test_jump_of_odometry_is_left_out():
     assert {step.i for step in measured.steps} == set(range(N - 1)) - {9, 10, 39}
     steps = measured.between([0, 4, 8, 12, 39, 42])
     assert [(s.i, s.j) for s in steps] == [(0, 4), (4, 8), (12, 39)]
-    expected = se3.inverse(holes[4]) @ holes[8]
-    np.testing.assert_allclose(steps[1].T_i_j, expected, atol=1e-9)
+    np.testing.assert_allclose(steps[1].T_i_j, se3.inverse(holes[4]) @ holes[8], atol=1e-9)
 
 
 def test_odometry_from_the_same_depth_is_no_evidence():
@@ -292,8 +288,7 @@ def test_odometry_from_the_same_depth_is_no_evidence():
     measured = measure_all((OdometryEdges(),), sensed(same, degenerate=wall), graph)
     assert {step.i for step in measured.steps} == {19, 20, 21, 22, 23}
     # Independent odometry differs by the errors of tracking, however good it is itself.
-    exact = measure_all((OdometryEdges(),), sensed(truth()), graph)
-    assert len(exact.steps) == N - 1
+    assert len(measure_all((OdometryEdges(),), sensed(truth()), graph).steps) == N - 1
 
 
 def test_odometry_with_known_errors_counts_where_the_path_rests_on_it():
@@ -321,8 +316,7 @@ def test_refinement_takes_unconstrained_tilt_from_gravity():
     views = []
     for k, T in enumerate(poses):
         frame = replace(corner(T), index=k)
-        wall = frame.keep(np.zeros_like(frame.valid))
-        assert wall.camera is frame.camera
+        assert frame.keep(np.zeros_like(frame.valid)).camera is frame.camera
         rays = frame.camera.rays()
         n = T[:3, :3].T @ np.array([0, 0, 1.0])
         z = (2.0 - T[2, 3]) / (rays @ n[:2] + n[2])

@@ -74,8 +74,7 @@ def test_gradient_and_curvature_match_objective():
     def whitened(x: Float64) -> Float64:
         moved = poses.copy()
         moved[system.free] = poses[system.free] @ se3.exp(x.reshape(-1, 6))
-        r = graph.with_poses(moved).residuals()
-        return np.einsum("mji,mj->mi", root, r).ravel()
+        return np.einsum("mji,mj->mi", root, graph.with_poses(moved).residuals()).ravel()
 
     h = 1e-6
     numeric = np.stack([(whitened(h * u) - whitened(-h * u)) / (2 * h) for u in np.eye(42)], axis=1)
@@ -208,8 +207,7 @@ def test_robust_kernels(kernel):
 )
 def test_benchmark_graphs_match_gtsam(shared_data, name, least):
     """Half the squared error, as GTSAM 4.3's Levenberg-Marquardt reports it from the same start."""
-    graph = read_g2o(shared_data / "pose_graphs" / f"{name}.g2o")
-    done = LevenbergMarquardt().optimise(graph)
+    done = LevenbergMarquardt().optimise(read_g2o(shared_data / "pose_graphs" / f"{name}.g2o"))
     assert done.converged
     assert done.graph.chi2() / 2 < 1.00001 * least
     assert (done.weights == 1).all()

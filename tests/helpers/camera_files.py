@@ -63,8 +63,7 @@ def make_realsense(path: Path) -> None:
 
 
 def make_orbbec(path: Path) -> None:
-    R = ros_bags.T_COLOR[:3, :3]
-    ros_bags.orbbec(path.parent, (0.0,) * 8, color="jpeg", R=R)
+    ros_bags.orbbec(path.parent, (0.0,) * 8, color="jpeg", R=ros_bags.T_COLOR[:3, :3])
 
 
 # The same of formats with clouds, with a camera by name or in the recording, and of bags.

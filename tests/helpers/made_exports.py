@@ -46,8 +46,7 @@ def points(z: np.ndarray, behind: float = 0.0) -> np.ndarray:
 def make_helios(folder: Path, count: int = 3) -> None:
     """PLY in mm from the front of the housing, in steps of 0.25 mm."""
     folder.mkdir(parents=True)
-    clouds = np.rint(points(depths(count), BEHIND_M) * 4000) / 4
-    for k, cloud in enumerate(clouds):
+    for k, cloud in enumerate(np.rint(points(depths(count), BEHIND_M) * 4000) / 4):
         light = amplitudes(count)[k].ravel().astype(np.float32)
         path = folder / f"Image_{k}.ply"
         write_ply(path, GeometryRecord(cloud.reshape(-1, 3), scalars={"intensity": light}))

@@ -53,8 +53,7 @@ def frame(k: int, model: int = 0, numbers: tuple[float, ...] = BOUGUET) -> bytes
     data += chunk(101, AMPLITUDE[k].astype("<u2").tobytes(), size, 2, k)
     data += chunk(300, FLAGS[k].tobytes(), size, 0, k)
     data += chunk(420, head_info(model=model, numbers=numbers), size, 0, k)
-    length = len(data) + 14
-    return b"0000L%09d\r\n0000star" % length + data + b"stop\r\n"
+    return b"0000L%09d\r\n0000star" % (len(data) + 14) + data + b"stop\r\n"
 
 
 def make_h5(path: Path, *, model: int = 0, heads: int = 1) -> None:

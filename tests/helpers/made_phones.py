@@ -70,8 +70,7 @@ def make_stray(folder: Path, *, lenses: bool = False) -> None:
     for k in range(3):
         write_png(folder / "depth" / f"{k:06d}.png", millimetres(DEPTH[k]))
         write_png(folder / "confidence" / f"{k:06d}.png", CONFIDENCE[k])
-        q = from_matrix(POSES[k, :3, :3])
-        row = [100 + k / 60, *POSES[k, :3, 3], *q]
+        row = [100 + k / 60, *POSES[k, :3, 3], *from_matrix(POSES[k, :3, :3])]
         cells = [f"{row[0]!r}", f"{k:06d}", *(repr(float(v)) for v in row[1:])]
         cells += [str(FX + k), str(FX + k), str(CX), str(CY)] if lenses else []
         lines.append(", ".join(cells))
@@ -165,8 +164,7 @@ def make_record3d(folder: Path) -> None:
     for k in range(3):
         depth = np.ascontiguousarray(DEPTH[k].T)
         (folder / "depth" / f"{k}.exr").write_bytes(exr_bytes(depth))
-        image = color_image(k, 8 * HEIGHT, 8 * WIDTH)
-        (folder / "rgb" / f"{k}.jpg").write_bytes(jpeg(image))
+        (folder / "rgb" / f"{k}.jpg").write_bytes(jpeg(color_image(k, 8 * HEIGHT, 8 * WIDTH)))
     (folder / "metadata.json").write_text(json.dumps(record3d_metadata()))
 
 

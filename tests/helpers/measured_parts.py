@@ -23,8 +23,7 @@ def drawn(*blocks: meshes.Mesh) -> Surface:
         ]
     )
     vertices = np.asarray(mesh.vertices, float)
-    faces = np.asarray(mesh.faces, np.int32)
-    return Surface("part", vertices, np.zeros_like(vertices), faces)
+    return Surface("part", vertices, np.zeros_like(vertices), np.asarray(mesh.faces, np.int32))
 
 
 def scan(

@@ -31,8 +31,7 @@ def seen(T_world_camera, boxes=FURNITURE, sigma=0.004, seed=0, walls=True):
     for centre, half, turn in boxes:
         R, half = se3.so3_exp([0, turn, 0]), np.array(half)
         best = np.minimum(best, to_box((origin - centre) @ R, rays @ R, -half, half)[0])
-    rng = np.random.default_rng([7, seed])
-    depth = best + sigma * rng.standard_normal(best.shape)
+    depth = best + sigma * np.random.default_rng([7, seed]).standard_normal(best.shape)
     depth[~(best < 8)] = 0
     return RangeFrame(seed, float(seed), CAMERA, depth.astype(np.float32), "z")
 

@@ -159,8 +159,7 @@ def test_information_predicts_scatter_for_true_pairs():
     chi2 = []
     for _ in range(300):
         target = se3.transform(T, source) + rng.normal(0, 0.02, source.shape)
-        before = alignment(source, target, T)
-        found = metric.motion(pairs(40), before) @ T
+        found = metric.motion(pairs(40), alignment(source, target, T)) @ T
         after = alignment(source, target, found)
         xi = se3.log(se3.inverse(T) @ found)
         chi2.append(xi @ metric.information(pairs(40), after) @ xi)

@@ -14,8 +14,7 @@ from tofuse.engine.icp.icp import algorithm_1
 
 def test_neighbours_of_real_recording(shared_data):
     """Steps of 3 to 5 cm, compared with reference poses accurate to about 1 cm."""
-    folder = shared_data / "sevenscenes_kitchen"
-    files = sorted(folder.glob("*.depth.png"))[20:44:2]
+    files = sorted((shared_data / "sevenscenes_kitchen").glob("*.depth.png"))[20:44:2]
     camera = Pinhole(width=160, height=120, fx=585 / 4, fy=585 / 4, cx=80, cy=60)
     frames, poses = [], []
     for k, file in enumerate(files):

@@ -242,8 +242,7 @@ FAULTS = {
 def test_good_recording_has_no_findings(turn) -> None:
     assert codes(turn) == set()
     assert codes(colored(turn, 0), quick=False) == set()
-    ranges = [replace(f, depth=f.radial_range, depth_kind="range") for f in turn]
-    assert codes(ranges) == set()
+    assert codes([replace(f, depth=f.radial_range, depth_kind="range") for f in turn]) == set()
 
 
 @pytest.mark.nightly_part
@@ -348,8 +347,7 @@ def test_outline_of_a_turntable_before_nothing_is_not_mirrored() -> None:
 
 
 def test_depth_beyond_a_wrong_ambiguity_range_is_not_of_a_wrong_unit() -> None:
-    frames = [image(2.5)]
-    inspected = tofuse.inspect(of(frames, metadata={"ambiguity_m": 0.5}))
+    inspected = tofuse.inspect(of([image(2.5)], metadata={"ambiguity_m": 0.5}))
     (found,) = [f for f in inspected.findings if f.code == "depth_unit"]
     assert found.remedy.startswith("Check ambiguity_m")
 
@@ -390,8 +388,7 @@ def test_colors_of_other_frames_are_not_mirrored(turn) -> None:
 
 
 def test_shift_that_does_not_follow_the_motion_is_no_delay() -> None:
-    rng = np.random.default_rng(4)
-    noise = 0.2 * rng.standard_normal((16, 2))
+    noise = 0.2 * np.random.default_rng(4).standard_normal((16, 2))
     varied, steady = np.zeros((2, 16, 2))
     varied[:, 1], steady[:, 1] = np.linspace(1.3, 2.8, 16), 2.0
     constant = np.array([0.0, 2.0]) + noise

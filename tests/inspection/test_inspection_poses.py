@@ -81,8 +81,7 @@ def sample(recording):
 def test_convention_is_named(sample, recording, words):
     # From a start that is not the identity, as where a device began elsewhere.
     start = se3.exp(np.array([1.0, -2, 0.5, 0.4, 0.9, -0.3]))
-    poses = start @ recording.reference
-    (found,) = misread_poses(sample, MISREAD[words](poses))
+    (found,) = misread_poses(sample, MISREAD[words](start @ recording.reference))
     assert found.code == ("depth_scale" if words in SCALES else "poses_misread")
     assert words in found.text
     assert all(np.isfinite(value) for value in found.evidence.values())
@@ -124,8 +123,7 @@ def test_missing_poses_are_left_out(sample, recording):
 
 @pytest.mark.parametrize("quick", [False, True])
 def test_inspection_reports_poses_of_recording(recording, quick):
-    frames = list(recording)
-    source = ArraySource(frames, recording.reference @ GL)
+    source = ArraySource(list(recording), recording.reference @ GL)
     found = tofuse.inspect(Recording.of(source, "somewhere", "frames"), quick=quick)
     assert [f.code for f in found.findings if f.severity == "warning"] == ["poses_misread"]
 
@@ -149,6 +147,5 @@ def test_a_slide_is_not_another_scale():
     t = np.linspace(0, 1.6, 20)
     reference = se3.exp(np.outer(t, [0, 0, 1.0, 0, 0, 0]))
     lag = np.where(t < 0.8, 0.1 * t, 0.08 + 0.3 * (t - 0.8))
-    estimate = se3.exp(np.outer(lag, [0, 0, 1.0, 0, 0, 0]))
-    assert difference(estimate, reference) is None
+    assert difference(se3.exp(np.outer(lag, [0, 0, 1.0, 0, 0, 0])), reference) is None
     assert "is 8 times" in difference(reference, with_scale(reference, 8))

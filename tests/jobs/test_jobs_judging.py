@@ -67,8 +67,7 @@ def test_correct_poses_are_good(of_truth) -> None:
 def test_stated_error_of_wrong_poses_is_correct(of_bent, truth) -> None:
     wrong, _ = displacement(truth, bent(truth))
     assert wrong > 0.02
-    stated = of_bent.accuracy.position_m
-    assert wrong < stated < 1.6 * wrong
+    assert wrong < of_bent.accuracy.position_m < 1.6 * wrong
     assert of_bent.verdict == "degraded"
     assert [r.code for r in of_bent.reasons] == ["inconsistent_poses", "jumped"]
     assert of_bent.reasons[0].ranges == ((3, 4),)
@@ -138,8 +137,7 @@ def test_poses_of_another_place_are_contradicted_and_replaced(recording, truth) 
 def test_result_has_the_bound_of_its_run_unless_contradicted(recording, tmp_path) -> None:
     result = tofuse.reconstruct(recording)
     stated = result.diagnostics.accuracy
-    of_result = tofuse.judge(recording, result)
-    assert of_result.accuracy == stated
+    assert tofuse.judge(recording, result).accuracy == stated
     # Poses alone don't say how well they are known.
     of_poses = tofuse.judge(recording, result.trajectory)
     assert of_poses.accuracy.position_m == pytest.approx(stated.position_m, rel=0.2)

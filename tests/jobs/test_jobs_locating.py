@@ -52,8 +52,7 @@ def clip(tmp_path_factory) -> Path:
 
 def locate_json(capfd, *words: object) -> tuple[int, dict]:
     capfd.readouterr()
-    status = call("locate", *words, "--json")
-    return status, json.loads(capfd.readouterr().out)
+    return call("locate", *words, "--json"), json.loads(capfd.readouterr().out)
 
 
 @pytest.mark.parametrize("k", [1, 4])
@@ -74,8 +73,7 @@ def test_camera_that_focuses_is_that_of_the_map(here) -> None:
     frame = seen(AGAIN[1], 501)
     for shift, same in ((0.5, True), (5.0, False)):
         camera = replace(frame.camera, cx=frame.camera.cx + shift)
-        config = here._map._config_of(replace(frame, camera=camera))
-        assert (config is here._map.config) == same
+        assert (here._map._config_of(replace(frame, camera=camera)) is here._map.config) == same
 
 
 def test_single_frame_is_corrected_like_its_recording(
@@ -109,8 +107,7 @@ def test_two_rooms_that_look_the_same_are_rivals(here) -> None:
     apart = se3.exp([20, 0, 0, 0, 0, 0])
     twice = [*views, *(type(v)(v.view, apart @ v.T_component_camera) for v in views)]
     locator = type(here._map.locator)(twice)
-    doubled = replace(here._map, locator=locator)
-    located = doubled.locate_frame(seen(AGAIN[2], 502))
+    located = replace(here._map, locator=locator).locate_frame(seen(AGAIN[2], 502))
     assert not located.accepted
     between = se3.inverse(located.location.T_map_camera) @ located.location.runner_up
     assert np.linalg.norm(between[:3, 3]) == pytest.approx(20, abs=0.3)
@@ -206,8 +203,7 @@ def test_clip_of_another_room_has_status_3(session_results, tmp_path, capfd) -> 
 
 
 def test_cloud_is_registered_with_points_of_the_map(session_results, tmp_path, capfd) -> None:
-    cloud = seen(AGAIN[0], 700)
-    write_ply(tmp_path / "view.ply", GeometryRecord(cloud.points))
+    write_ply(tmp_path / "view.ply", GeometryRecord(seen(AGAIN[0], 700).points))
     status, data = locate_json(capfd, session_results["here"], tmp_path / "view.ply")
     (frame,) = data["frames"]
     assert status == (0 if frame["accepted"] else 3)

@@ -210,8 +210,7 @@ def stored(path: Path, notes: list[str], count: int = 3) -> TrackedFile:
     file, log = TrackedFile(path, "key", notes.append), FrameLog()
     tracker = file.tracker(Still())
     for k in range(count):
-        frame = seen(np.eye(4), k)
-        log.add(FrameRecord(k, 0.1 * k, "tracked"), tracker.push(frame))
+        log.add(FrameRecord(k, 0.1 * k, "tracked"), tracker.push(seen(np.eye(4), k)))
     file.finish(tracker, log)
     return file
 

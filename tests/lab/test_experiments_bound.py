@@ -19,8 +19,7 @@ def test_bound_of_cube_seen_twice():
             normals.append(np.tile(side * np.eye(3)[axis], (4, 1)))
     points, normals = np.concatenate(points), np.concatenate(normals)
     seen = np.ones((24, 2), bool)
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    C = pose_covariances(points, normals, seen, poses, 0.1)
+    C = pose_covariances(points, normals, seen, np.tile(np.eye(4), (2, 1, 1)), 0.1)
     np.testing.assert_array_equal(C[0], 0)
     # 8 samples face each axis; 16 of them, with a lever of 0.5 m, constrain each rotation.
     np.testing.assert_allclose(np.diag(C[1]), [2 * 0.01 / 8] * 3 + [2 * 0.01 / 4] * 3)

@@ -109,8 +109,7 @@ def test_inliers_are_separated_from_outliers(method, right, wrong):
 def test_one_inlier_in_fifty_pairs_is_enough(seed):
     """So few that sets of compatible pairs must be small to have no outliers."""
     pairs, T = made_pairs(10, 500, seed=seed)
-    found = consensus_of(pairs, ConsensusOptions())
-    shift, turn = pose_error(found[0].T_target_source, T)
+    shift, turn = pose_error(consensus_of(pairs, ConsensusOptions())[0].T_target_source, T)
     assert shift < 0.06
     assert turn < 2
 

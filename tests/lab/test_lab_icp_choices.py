@@ -147,8 +147,7 @@ def test_intensity_gradient_selects_edges_of_pattern():
 
 def test_normal_shooting_finds_intersection_along_normal():
     x, y = (a.ravel() for a in np.meshgrid(np.arange(-40, 41) * 0.01, np.arange(-40, 41) * 0.01))
-    plane = np.column_stack([x, y, 1.5 + 0.5 * x])
-    target = view(plane)
+    target = view(np.column_stack([x, y, 1.5 + 0.5 * x]))
     normal = np.array([0.3, -0.2, -1.0]) / np.linalg.norm([0.3, -0.2, -1.0])
     start = np.array([[0.02, 0.01, 1.4], [-0.05, 0.1, 1.55]])
     source = CloudFrame(
@@ -238,8 +237,7 @@ def test_closest_invariant_weighs_shape_against_distance():
 
 def with_normals(normals):
     normals = np.asarray(normals, np.float32)
-    points = np.zeros((len(normals), 3), np.float32)
-    return CloudFrame(0, 0.0, points, normals=normals)
+    return CloudFrame(0, 0.0, np.zeros((len(normals), 3), np.float32), normals=normals)
 
 
 def test_normal_compatibility_uses_rotated_normals():
@@ -316,8 +314,7 @@ def test_small_step_stops_at_small_motions_and_cycles():
     rule = SmallStep(0.01, 50)
     assert rule.met(History([5], [1.0], [0.009]))
     assert not rule.met(History([5], [1.0], [0.011]))
-    to_and_fro = History([5, 6, 5, 6, 5], [1.0, 2.0, 1.0, 2.0, 1.0], [1.0] * 5)
-    assert rule.met(to_and_fro)
+    assert rule.met(History([5, 6, 5, 6, 5], [1.0, 2.0, 1.0, 2.0, 1.0], [1.0] * 5))
     assert not rule.met(History([5, 6, 4, 6, 5], [1.0, 2.0, 1.0, 2.0, 1.0], [1.0] * 5))
     assert not rule.met(History([5] * 5, [1.0, 0.9, 0.8, 0.7, 0.6], [1.0] * 5))
 
@@ -329,5 +326,4 @@ def test_normals_point_towards_sensor():
     sheet = relief(500, 0)
     for z in (0.0, 5.0):
         at = np.array([0.1, 0.2, z])
-        normals = everything(view(sheet, origin=at)).normals
-        assert ((normals * (at - sheet)).sum(1) > 0).all()
+        assert ((everything(view(sheet, origin=at)).normals * (at - sheet)).sum(1) > 0).all()

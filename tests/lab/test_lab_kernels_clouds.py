@@ -15,8 +15,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def test_moments_match_twin_and_are_rotation_invariant():
-    r = np.random.default_rng(3)
-    points = r.normal(size=(500, 3))
+    points = np.random.default_rng(3).normal(size=(500, 3))
     centres = np.vstack([points[:50], [[50, 0, 0]]])
     found = FeaturedKdTree(points).moments(centres, 0.7)
     for c, values in zip(centres, found, strict=True):

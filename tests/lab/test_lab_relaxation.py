@@ -39,8 +39,7 @@ def ring(n: int, noise: float, seed: int = 0, loops: int = 1) -> tuple[PoseGraph
 def test_linear_system_matches_paper():
     """G X = B, block by block."""
     graph, _ = ring(8, 0.01, loops=2)
-    system = PairSystem(8, graph.edges)
-    X = solve_linear(graph, system)
+    X = solve_linear(graph, PairSystem(8, graph.edges))
     G, B = np.zeros((8, 6, 8, 6)), np.zeros((8, 6))
     for (i, j), e, W in zip(graph.edges, graph.residuals(), graph.information, strict=True):
         A = se3.adjoint(graph.poses[j])

@@ -47,8 +47,7 @@ def test_ground_truth_is_unaffected_by_passing_object() -> None:
 
 
 def test_passing_pixels_are_flagged_and_nearer(tmp_path) -> None:
-    effects = Effects.none()
-    options = {"every": 3, "frames": 3, "first": 66, "effects": effects}
+    options = {"every": 3, "frames": 3, "first": 66, "effects": Effects.none()}
     passing = Passing("box", 0.3, start_s=-1.0)
     path = simulate("rail", tmp_path / "rail", passing=passing, **options)
     flags = read_image(path / "truth" / "flags" / "000000.png") & Flag.PASSING > 0

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.geometry import se3
+from tofuse.lab.world.mesh import Mesh
 from tofuse.lab.world.scene import SCENES, Scene, build
 
 
@@ -97,8 +98,7 @@ def test_turn_closes_after_last_frame(built, name):
     np.testing.assert_allclose(sequence.T_world_camera(whole), np.eye(4), atol=1e-9)
     last = sequence.T_world_camera((sequence.frames - sequence.stride) / 30)
     assert 1.0 < np.rad2deg(se3.angle(last)) < 4.0
-    half = sequence.T_world_camera(whole / 2)
-    assert np.rad2deg(se3.angle(half)) > 175
+    assert np.rad2deg(se3.angle(sequence.T_world_camera(whole / 2))) > 175
     # Turning to the right is positive about the camera's y axis, which points down.
     quarter = sequence.T_world_camera(whole / 4)
     np.testing.assert_allclose(quarter[:3, 2], [1, 0, 0], atol=0.03)
@@ -110,11 +110,10 @@ def test_visible_points_lie_on_truth_mesh(built, name):
     """Hits, mapped by the true pose into the world and back onto the truth mesh."""
     scene, sequence = built[name]
     vertices, faces = scene.truth_mesh()
-    T = sequence.T_world_truth()
-    truth = se3.transform(T, vertices)
+    truth = se3.transform(sequence.T_world_truth(), vertices)
     moving = sequence.T_room_object(0.0) is not None
     rays = sr4000_rays(12)
-    alone = Scene("truth", scene.materials, _mesh(truth, faces))
+    alone = Scene("truth", scene.materials, Mesh.of(truth, faces))
     for t in (0.0, 0.31 * sequence.frames / 30, 0.77 * sequence.frames / 30):
         hits = look(scene, sequence, t, rays)
         pose = sequence.T_world_camera(t)
@@ -122,12 +121,6 @@ def test_visible_points_lie_on_truth_mesh(built, name):
         near = np.isfinite(again.distance) if moving else np.ones(len(rays), bool)
         assert near.mean() > 0.05
         np.testing.assert_allclose(again.distance[near], hits.distance[near], atol=1e-5)
-
-
-def _mesh(vertices, faces):
-    from tofuse.lab.world.mesh import Mesh
-
-    return Mesh.of(vertices, faces)
 
 
 def surface(scene, name):

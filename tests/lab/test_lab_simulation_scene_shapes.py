@@ -61,8 +61,7 @@ def test_surface_net_of_ball_is_closed_and_accurate():
         blends.ellipsoid((0.1, 0, 0), (0.5, 0.5, 0.5)), (-1, -1, -1), (1, 1, 1), 0.08
     )
     assert is_closed(ball)
-    radius = np.linalg.norm(ball.vertices - (0.1, 0, 0), axis=1)
-    assert np.abs(radius - 0.5).max() < 1e-5
+    assert np.abs(np.linalg.norm(ball.vertices - (0.1, 0, 0), axis=1) - 0.5).max() < 1e-5
     assert volume(ball) == pytest.approx(4 / 3 * np.pi * 0.125, rel=0.02)
 
 
@@ -87,8 +86,7 @@ def test_person_is_closed_and_human_sized(person):
 def test_no_ray_leaves_the_person(person):
     mesh, materials = person
     scene = Scene("person", materials, mesh)
-    rng = np.random.default_rng([0, 21])
-    d = rng.normal(size=(20000, 3))
+    d = np.random.default_rng([0, 21]).normal(size=(20000, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     for inside in ((0, 0, 0.9), (0.01, 0, 1.27)):
         assert np.isfinite(scene.cast(inside, d).distance).all()

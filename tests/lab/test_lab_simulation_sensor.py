@@ -158,8 +158,7 @@ def mixed_range(near: float, far: float, share: float, row: int, column: int) ->
 def test_mixed_pixels_are_phasor_sums() -> None:
     # On the half-pixel grid, the border between two pixels has weight 1/4, the centre 1/2.
     for offset, share in ((-0.25, 0.25), (0.25, 0.75)):
-        scene = edge(1.2, 2.2, 25 + offset)
-        rendered = shoot(scene, Effects.none(mixed_pixels=True))
+        rendered = shoot(edge(1.2, 2.2, 25 + offset), Effects.none(mixed_pixels=True))
         seen = rendered.frame.radial_range[16:20, 25]
         expected = [mixed_range(1.2, 2.2, share, v, 25) for v in range(16, 20)]
         np.testing.assert_allclose(seen, expected, atol=0.003)
@@ -232,8 +231,7 @@ def corner(albedo: float = 0.6) -> Boards:
 def test_corner_multipath_matches_integral_over_walls() -> None:
     """Falloff: half lamp, half lens; bounced light has that of the lamp at its source."""
     model = replace(MODEL, camera=Pinhole(176, 144, 152.0, 152.0, 87.5, 71.5))
-    only = Effects.none(multipath=True)
-    found = render(corner(), STILL, model, 0, effects=only).frame
+    found = render(corner(), STILL, model, 0, effects=Effects.none(multipath=True)).frame
     direct = render(corner(), STILL, model, 0, effects=Effects.none()).frame
     k = 2 * np.pi / (2 * model.period_m)
     # Uniform points of both walls; the lamp fades out at 1.1 to 1.3 times the corner angle.
@@ -268,8 +266,7 @@ def test_mirror_shows_reflected_surface_at_longer_path() -> None:
     mirror = Board((0, 0, 1.0), a=(0.7, 0, 0.7), b=(0, 1, 0), albedo=0.0, gloss=1.0)
     side = Board((1.5, 0, 1.0), a=(0, 0, 3), b=(0, 3, 0), albedo=0.8)
     rendered = shoot(Boards([mirror, side]), Effects.none(gloss=True))
-    seen = rendered.frame.radial_range[CENTRE]
-    assert seen == pytest.approx(2.5, abs=0.05)
+    assert rendered.frame.radial_range[CENTRE] == pytest.approx(2.5, abs=0.05)
     assert rendered.flags[CENTRE] & Flag.MIRROR
     assert rendered.depth[CENTRE] == pytest.approx(1.0, abs=0.02)
 

@@ -121,8 +121,7 @@ def test_better_of_guess_and_identity_is_used():
     near_identity = pose(0.2)
     drifted = pose(3.0)
     registrar = Scripted(near_identity)
-    closed = Confirmation((registrar,)).confirm(view(9), view(2), drifted, seed=0)
-    assert closed.record.accepted
+    assert Confirmation((registrar,)).confirm(view(9), view(2), drifted, seed=0).record.accepted
     np.testing.assert_array_equal(registrar.calls[0], drifted)
     np.testing.assert_array_equal(registrar.calls[1], np.eye(4))
     far = pose(3.0)
@@ -145,8 +144,7 @@ def test_registrations_are_chained_and_seeded():
 
 def test_candidates_are_recorded_and_given_loops_used():
     poses = turning(20)
-    motion = se3.inverse(poses[0]) @ poses[20]
-    confirmation = Confirmation((Scripted(motion),))
+    confirmation = Confirmation((Scripted(se3.inverse(poses[0]) @ poses[20]),))
     by_hand = pose(0.05)
     given = [PriorLoop(0, 20, by_hand), PriorLoop(5, 21), PriorLoop(3, 17)]
     loops = Nearby(max_yaw_rad=0.01, min_gap=8, confirmation=confirmation)
@@ -177,5 +175,4 @@ def test_real_registrations_distinguish_loop_from_other_place():
     away = se3.log(se3.inverse(truth[1]) @ near.T_i_j)
     assert np.linalg.norm(away[:3]) < 0.5
     assert np.linalg.norm(away[3:]) < 0.05
-    other = confirmation.confirm(views[10], views[0], truth[10], seed=0)
-    assert not other.record.accepted
+    assert not confirmation.confirm(views[10], views[0], truth[10], seed=0).record.accepted

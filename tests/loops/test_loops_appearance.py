@@ -81,13 +81,11 @@ def test_loop_is_closed_at_45_degrees_of_drift(full_turn):
     poses = drifted(truth, 45)
     without_search = found_in(views, poses, Appearance(pairs=0))
     assert not any(c.record.accepted for c in without_search)
-    found = found_in(views, poses, Appearance(pairs=2))
-    closed = [c for c in found if c.record.accepted]
+    closed = [c for c in found_in(views, poses, Appearance(pairs=2)) if c.record.accepted]
     assert closed
     for c in closed:
         assert c.record.j - c.record.i >= 16
-        true = se3.inverse(truth[c.record.i]) @ truth[c.record.j]
-        assert_near(c.T_i_j, true, 0.04, 1.5)
+        assert_near(c.T_i_j, se3.inverse(truth[c.record.i]) @ truth[c.record.j], 0.04, 1.5)
         assert "looks similar" in c.record.reason
         assert np.linalg.eigvalsh(c.information).min() > 0
 

@@ -120,8 +120,7 @@ def test_order_of_links_does_not_matter(three, seed) -> None:
 
 
 def test_views_of_two_scenes_stay_separate(three, elsewhere) -> None:
-    both = [three[0], elsewhere]
-    groups = SPARSELY.join(both, [])
+    groups = SPARSELY.join([three[0], elsewhere], [])
     assert members(groups) == [[0], [1]]
     assert all(not group.joins for group in groups)
 
@@ -387,14 +386,12 @@ def min_probability(three, monkeypatch):
 
 def test_independent_links_raise_probability(three, min_probability) -> None:
     a, b = three[0].views, three[1].views
-    one = min_probability([probable(a[-1], b[0], 0.95)])
-    assert one == pytest.approx(0.95)
+    assert min_probability([probable(a[-1], b[0], 0.95)]) == pytest.approx(0.95)
     # The same views again add little: here the rotations are 0.24 rad.
     same = min_probability([probable(a[-1], b[0], 0.95), probable(a[-1], b[1], 0.95)])
     odds = 19 ** (1 + 0.24 / MAX_OVERLAP_DISTANCE) / 2
     assert same == pytest.approx(odds / (1 + odds), abs=0.02)
-    other = min_probability([probable(a[-1], b[0], 0.95), probable(a[0], b[-1], 0.95)])
-    assert other > same
+    assert min_probability([probable(a[-1], b[0], 0.95), probable(a[0], b[-1], 0.95)]) > same
 
 
 def test_first_group_is_main_on_request(three) -> None:

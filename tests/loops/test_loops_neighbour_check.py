@@ -21,13 +21,9 @@ SIGMA = np.array([0.003] * 3 + [0.002] * 3)
 SIDEWAYS = se3.exp(np.array([0.08, 0.0, 0.0, 0.0, 0.0, 0.0]))
 
 
-def displaced_from(truth, k):
-    return np.concatenate([truth[:k], truth[k:] @ SIDEWAYS])
-
-
 def test_separated_neighbours_are_found_where_registrations_are_uncertain(posed_views) -> None:
     posed, truth = posed_views
-    pulled = displaced_from(truth, 3)
+    pulled = np.concatenate([truth[:3], truth[3:] @ SIDEWAYS])
     everywhere = frozenset(range(len(truth)))
     assert list(degraded_neighbours(posed, truth, pulled, everywhere)) == [(2, 3)]
     assert list(degraded_neighbours(posed, truth, pulled, frozenset({3}))) == [(2, 3)]
@@ -69,8 +65,7 @@ def closed(truth) -> ClosedLoop:
 
 def test_loop_gap_does_not_separate_consistent_images(posed_views) -> None:
     posed, truth = posed_views
-    n = len(truth)
-    wrong, unusual = 2, n - 2
+    wrong, unusual = 2, len(truth) - 2
     loop = closed(truth)
     end = chain(posed, truth, {unusual: 100.0}, wrong)
 

@@ -30,8 +30,7 @@ turn = revisited_path.turn  # the fixture
 
 def test_revisited_place_is_measured_despite_drift(turn):
     frames, truth, start = turn
-    found = pushed(Revisits(searches=0), frames, start)
-    closed = [c for c in found if c.record.accepted]
+    closed = [c for c in pushed(Revisits(searches=0), frames, start) if c.record.accepted]
     assert closed
     assert any(c.record.i == 0 and c.record.j >= 11 for c in closed)
     for c in closed:
@@ -113,8 +112,7 @@ def test_view_of_another_place_is_rejected_with_reason(turn):
         ),
     ]
     options = Revisits(overlap=0.15, searches=0)
-    found = pushed(options, strange, start)
-    late = [c for c in found if c.record.j >= 11]
+    late = [c for c in pushed(options, strange, start) if c.record.j >= 11]
     assert late
     for c in late:
         assert not c.record.accepted

@@ -61,8 +61,7 @@ def recording(frames: list[RangeFrame], exponent: float) -> Recording:
         assert frame.amplitude_image is not None
         light = frame.amplitude_image / ray_lengths(frame.camera) ** exponent
         fallen.append(replace(frame, amplitude_image=light.astype(np.float32)))
-    source = ArraySource(tuple(fallen))
-    return Recording.of(source, "made", "arrays")
+    return Recording.of(ArraySource(tuple(fallen)), "made", "arrays")
 
 
 @pytest.mark.parametrize("exponent", [-3.0, 2.0, 5.0])

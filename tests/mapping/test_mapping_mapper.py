@@ -235,8 +235,7 @@ def test_depth_in_mm_is_named(frames) -> None:
 
 
 def test_filter_for_images_refuses_clouds_early(frames) -> None:
-    config = replace(CONFIG, filters=(TemporalDeviation(),))
-    mapper = Mapper(config)
+    mapper = Mapper(replace(CONFIG, filters=(TemporalDeviation(),)))
     with pytest.raises(InputError, match=r"filter 'temporal' takes .'range'. views"):
         mapper.push(CloudFrame.of(frames[0].points))
     mapper.push(frames[0])  # the refused view does not set the kind
@@ -270,8 +269,7 @@ def test_preparation_out_of_order_gives_same_result(
 
 
 def test_lost_frame_has_no_pose_and_tracking_continues(frames) -> None:
-    lost = [blank(f) if f.index == 3 else f for f in frames]
-    result = reconstruct(in_memory(lost), CONFIG)
+    result = reconstruct(in_memory([blank(f) if f.index == 3 else f for f in frames]), CONFIG)
     assert result.has_pose.tolist() == [k != 3 for k in range(8)]
     assert [f.status for f in result.diagnostics.frames].count("lost") == 1
     assert "0 valid points" in result.diagnostics.frames[3].reason
@@ -314,8 +312,7 @@ def test_clouds_all_around_have_z_up(frames) -> None:
         assert (CloudFrame.of(turned).likely_up is None) == (up[2] == 0)
         result = reconstruct(in_memory([CloudFrame.of(turned)]))
         np.testing.assert_allclose(result.T_up_world[1, :3], up, atol=0.02)
-    stated = CloudFrame.of(points, up=np.array([1.0, 0, 0]))
-    result = reconstruct(in_memory([stated]))
+    result = reconstruct(in_memory([CloudFrame.of(points, up=np.array([1.0, 0, 0]))]))
     np.testing.assert_allclose(result.T_up_world[1, :3], [1, 0, 0], atol=0.02)
 
 

@@ -41,8 +41,7 @@ def test_precise_estimates_do_not_weigh_more_if_estimates_truly_differ() -> None
 
 @pytest.mark.parametrize("wild", [-4.0, 50.0])
 def test_outlier_hardly_changes_estimate(wild: float) -> None:
-    rng = np.random.default_rng(3)
-    good = rng.normal(0.3, 0.05, 11)
+    good = np.random.default_rng(3).normal(0.3, 0.05, 11)
     mean, deviation = pooled(np.r_[good, wild], np.ones(12))
     assert mean == pytest.approx(good.mean(), abs=0.02)
     assert deviation < 0.04

@@ -82,8 +82,7 @@ def test_device_poses_give_gravity_direction(recording) -> None:
     result = lonely(trajectory=poses, timestamps=np.arange(n), sequential=poses, frames=frames)
     np.testing.assert_allclose(device_up(phone, result), [-0.6, -0.8, 0.0], atol=1e-9)
     assert device_up(recording, result) is None
-    lost = replace(result, trajectory=np.full_like(poses, np.nan))
-    assert device_up(phone, lost) is None
+    assert device_up(phone, replace(result, trajectory=np.full_like(poses, np.nan))) is None
 
 
 def test_prior_none_uses_images_only(recording) -> None:
@@ -112,8 +111,7 @@ def test_odometry_file_takes_precedence_over_device_poses(recording) -> None:
 
 @pytest.mark.parametrize(("prior", "sensors"), [("auto", ["odometry"]), ("none", [])])
 def test_python_uses_device_poses_as_the_command_line_does(recording, prior, sensors) -> None:
-    phone = by_phone(recording).select(end=6)
-    result = tofuse.reconstruct(phone, COARSE, prior=prior)
+    result = tofuse.reconstruct(by_phone(recording).select(end=6), COARSE, prior=prior)
     assert [sensor.sensor for sensor in result.diagnostics.priors] == sensors
 
 

@@ -46,8 +46,7 @@ def reconstructed(frames, truth, most):
         mapper.push(replace(frame, timestamp=float(k)))
     result = mapper.finish()
     accepted = {(loop.i, loop.j) for loop in result.diagnostics.loops if loop.accepted}
-    off = result.trajectory[:, :3, 3] - truth[:, :3, 3]
-    return accepted, np.linalg.norm(off, axis=1)
+    return accepted, np.linalg.norm(result.trajectory[:, :3, 3] - truth[:, :3, 3], axis=1)
 
 
 def test_loops_are_searched_again_where_first_ones_corrected_path(turn):  # noqa: F811

@@ -45,8 +45,7 @@ def frame(camera=CAMERA, kind="z") -> RangeFrame:
 @pytest.mark.parametrize("distortion", [0.0, -0.04])
 def test_corrected_points_are_correct(camera, kind, distortion) -> None:
     before = frame(camera, kind)
-    errors = CameraErrors(0.1, 0.05, 0.02, -0.03, distortion)
-    after = errors.start().apply(before)
+    after = CameraErrors(0.1, 0.05, 0.02, -0.03, distortion).start().apply(before)
     assert isinstance(after, RangeFrame)
     np.testing.assert_array_equal(after.valid, before.valid)
     slopes = [f.points[:, :2] / f.points[:, 2:] for f in (before, after)]
@@ -259,8 +258,7 @@ def test_nothing_is_corrected_where_nothing_bounds_the_poses(any_result) -> None
     """There, views may have slid: a correction that makes them agree may only explain that."""
     first = assessed(any_result, 0.05, np.inf)
     again = assessed(any_result, None, np.inf)
-    result = self_calibrated(first, from_method("default"), lambda _: again, Silent())
-    assert result is first
+    assert self_calibrated(first, from_method("default"), lambda _: again, Silent()) is first
 
 
 def test_second_estimate_is_composed_with_first(any_result) -> None:

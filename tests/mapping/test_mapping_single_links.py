@@ -44,5 +44,4 @@ def loop(i, j, accepted=True):
     ],
 )
 def test_frames_behind_a_single_link(joins, loops, expected) -> None:
-    tracked = TrackedGraph(POSED, {}, joins)
-    assert single_link_frames(tracked, loops) == expected
+    assert single_link_frames(TrackedGraph(POSED, {}, joins), loops) == expected

@@ -148,8 +148,7 @@ def test_a_room_like_the_reflection_has_no_second_path(is_mirror: bool, far_wall
     normals = np.repeat([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], len(sides[0]), axis=0)
     if far_wall:
         points, normals = np.r_[points, _room()[0]], np.r_[normals, _room()[1]]
-    lamp = _before_the_mirror(4.0)
-    seen = predict(_OPENING, _OPENING.plane, [lamp], points, normals, _NOISE)
+    seen = predict(_OPENING, _OPENING.plane, [_before_the_mirror(4.0)], points, normals, _NOISE)
     ranges = np.full(60 * 60, 4.0)
     shorter = 0.5 * (seen.length - seen.direct)
     ranges[seen.pixels] = seen.length - is_mirror * seen.direct_share * shorter
@@ -185,12 +184,10 @@ def test_an_opening_is_seen_in_front_of_its_plane_only() -> None:
     assert not _OPENING.seen_by(behind, 0.0)
     turned = se3.exp(np.array([0, 0, 0, np.pi, 0, 0]))
     turned[2, 3] = 2.0
-    front = replace(behind, T_world_camera=turned)
-    assert _OPENING.seen_by(front, 0.0)
+    assert _OPENING.seen_by(replace(behind, T_world_camera=turned), 0.0)
     turned = turned.copy()
     turned[0, 3] = 5.0
-    aside = replace(behind, T_world_camera=turned)
-    assert not _OPENING.seen_by(aside, 0.0)
+    assert not _OPENING.seen_by(replace(behind, T_world_camera=turned), 0.0)
 
 
 def test_ranges_are_too_short_where_other_views_see_through() -> None:

@@ -71,8 +71,7 @@ def test_confidence_is_monotone_and_saturates_at_last_level() -> None:
 
 def test_noise_of_every_family_is_monotone() -> None:
     for model in NOISE.values():
-        ramp = np.linspace(0.5, 6, 40)
-        plain = model.sigma(frame(ramp))
+        plain = model.sigma(frame(np.linspace(0.5, 6, 40)))
         assert (np.diff(plain[0]) > 0).all()
         assert 0.0002 < plain[0, 5] < 0.1
         light = model.sigma(frame(2.0, amplitude_image=image(np.geomspace(1, 5000, 40))))
@@ -98,8 +97,7 @@ def test_precedence_of_laws() -> None:
 def test_invalid_pixels_have_no_sigma() -> None:
     depth = image(2.0)
     depth[3, 4] = 0
-    seen = frame(depth)
-    sigma = DARK.sigma(seen)
+    sigma = DARK.sigma(frame(depth))
     assert sigma.dtype == np.float32
     assert sigma[3, 4] == 0
     assert (sigma > 0).sum() == sigma.size - 1
@@ -168,6 +166,5 @@ def test_invalid_files(tmp_path: Path, text: str) -> None:
 
 
 def test_documented_file_is_valid() -> None:
-    text = (DOCS / "noise.md").read_text()
-    (block,) = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
+    (block,) = re.findall(r"```json\n(.*?)```", (DOCS / "noise.md").read_text(), re.DOTALL)
     assert NoiseModel.from_dict(json.loads(block)).name == "mine"

@@ -57,8 +57,7 @@ def test_mesh_files_are_sampled_over_their_area(suffix, tmp_path) -> None:
 
 
 def test_meshes_clouds_and_frames_are_taken() -> None:
-    mesh = Mesh.of(bench())
-    near(tofuse.register(seen(bench()), mesh, guess=np.eye(4)))
+    near(tofuse.register(seen(bench()), Mesh.of(bench()), guess=np.eye(4)))
     source, target = stone(3000, 1), stone(3000, 0)
     cloud = Cloud(target.astype(np.float32), None, None, np.ones(3000, np.int32))
     by_array = tofuse.register(source, target)

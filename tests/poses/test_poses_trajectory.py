@@ -87,8 +87,7 @@ def test_nearest_within_limit() -> None:
 
 
 def test_association_matches_slow_search() -> None:
-    rng = np.random.default_rng(9)
-    a, b = np.arange(60) / 30, rng.uniform(0, 2, 70)
+    a, b = np.arange(60) / 30, np.random.default_rng(9).uniform(0, 2, 70)
     a[7] = b[3] = np.nan
     gaps = np.abs(a[:, None] - b)
     expected = []

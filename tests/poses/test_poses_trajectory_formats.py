@@ -80,16 +80,14 @@ def test_all_formats_give_same_poses(name: str, tmp_path: Path) -> None:
     FORMATS[name](tmp_path / name)
     found = read_poses(tmp_path / name)
     assert (found.timestamps is not None) == (name in TIMED)
-    of_frames = found.of_frames(TIMES, np.arange(5))
-    np.testing.assert_allclose(of_frames, POSES, atol=1e-6)
+    np.testing.assert_allclose(found.of_frames(TIMES, np.arange(5)), POSES, atol=1e-6)
     if found.timestamps is not None:
         np.testing.assert_allclose(found.timestamps, TIMES, atol=1e-6)
 
 
 def test_numbered_poses_are_assigned_to_selected_frames(tmp_path: Path) -> None:
     transforms(tmp_path / "transforms.json")
-    found = read_poses(tmp_path / "transforms.json")
-    some = found.of_frames(TIMES[:3], np.array([2, 9, 4]))
+    some = read_poses(tmp_path / "transforms.json").of_frames(TIMES[:3], np.array([2, 9, 4]))
     np.testing.assert_allclose(some[[0, 2]], POSES[[2, 4]], atol=1e-9)
     assert np.isnan(some[1]).all()
 

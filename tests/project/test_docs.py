@@ -189,8 +189,7 @@ def test_version_is_the_same_everywhere() -> None:
 
 
 def test_buildings_are_described_in_order_of_imports() -> None:
-    project = tomllib.loads(text_of("pyproject.toml"))
-    contracts = project["tool"]["importlinter"]["contracts"]
+    contracts = tomllib.loads(text_of("pyproject.toml"))["tool"]["importlinter"]["contracts"]
     house = sections("ARCHITECTURE.md")["The house"]
     buildings = [layer for layer in contracts[0]["layers"] if not layer.startswith("_")]
     assert re.findall(r"^\| `(\w+)` \|", house, re.MULTILINE) == buildings[::-1]
@@ -336,8 +335,7 @@ def test_notebooks_run(
     shutil.copytree(short_recording, tmp_path / "scan")
     monkeypatch.chdir(tmp_path)
     simulate_less(monkeypatch, "all", frames=3)
-    names = run_notebook(path)
-    assert len(names["recording"]) > 1
+    assert len(run_notebook(path)["recording"]) > 1
 
 
 @pytest.mark.nightly

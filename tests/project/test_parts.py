@@ -183,8 +183,7 @@ def test_config_finds_parts_of_installed_packages(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     filters = {"filters": [{"part": "of-another-package", "amount": 5}]}
     try:
-        config = changed(from_method("default"), filters, where="test")
-        assert config.filters[0].amount == 5
+        assert changed(from_method("default"), filters, where="test").filters[0].amount == 5
     finally:
         parts._registry["filter"].pop("of-another-package", None)
 

@@ -83,8 +83,7 @@ def test_python_versions_agree() -> None:
     oldest, newest = stated[0], stated[-1]
     assert stated == [f"3.{k}" for k in range(int(oldest[2:]), int(newest[2:]) + 1)]
     assert PROJECT["project"]["requires-python"] == f">={oldest}"
-    found = python_versions()
-    assert {oldest, newest} <= set(found) <= set(stated)
+    assert {oldest, newest} <= set(python_versions()) <= set(stated)
     assert PROJECT["tool"]["ruff"]["target-version"] == f"py{oldest.replace('.', '')}"
     assert f"sys.version_info < (3, {oldest[2:]})" in MAKEFILE
     assert f"--python-version {oldest} " in MAKEFILE

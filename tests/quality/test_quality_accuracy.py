@@ -271,13 +271,11 @@ def test_single_constrained_pair_of_degenerate_view_is_chance(corners, constrain
 
 
 def flat_wall():
-    z = np.full((60, 80), 2.0, np.float32)
-    return prepare_view(as_frame(z, 0), SurfaceOptions())
+    return prepare_view(as_frame(np.full((60, 80), 2.0, np.float32), 0), SurfaceOptions())
 
 
 def surface_of_corner():
-    rays = CAMERA.rays()
-    x, y = np.moveaxis(rays, -1, 0)
+    x, y = np.moveaxis(CAMERA.rays(), -1, 0)
     planes = [(0.6, 0.0, 0.8), (-0.6, 0.0, 0.8), (0.0, -0.8, 0.6)]
     z = np.min([1.5 / (a * x + b * y + c) for a, b, c in planes], axis=0)
     return prepare_view(as_frame(z.astype(np.float32), 0), SurfaceOptions())
@@ -292,8 +290,7 @@ def as_frame(z, index) -> RangeFrame:
 
 
 def test_other_directions_of_degenerate_frame_stay_bounded() -> None:
-    graph = bounded(walk(), {5: X})
-    C = covariances_of(GraphCovariances(graph), ObservedErrors())[5]
+    C = covariances_of(GraphCovariances(bounded(walk(), {5: X})), ObservedErrors())[5]
     sigma = np.sqrt(np.linalg.eigvalsh(C[:3, :3]))
     assert sigma[1] < 0.05
     assert sigma[2] > 1
@@ -302,8 +299,7 @@ def test_other_directions_of_degenerate_frame_stay_bounded() -> None:
 def test_degenerate_start_leaves_rest_bounded() -> None:
     """Relative to the first frame, all poses would be unbounded."""
     graph = bounded(walk(loops=((2, N - 1),)), {0: X, 1: X})
-    a = accuracy_of(GraphCovariances(graph), ObservedErrors(), 1.0)
-    assert a.unbounded == (0, 1)
+    assert accuracy_of(GraphCovariances(graph), ObservedErrors(), 1.0).unbounded == (0, 1)
 
 
 def test_extrapolated_motion_bounds_nothing() -> None:
@@ -330,8 +326,7 @@ def test_slide_along_bare_walls_is_unbounded(scene) -> None:
     effects = Effects.none(shot_noise=True)
     recording = simulate_recording(scene, frames=8, every=2, texture=False, effects=effects)
     coarse = {"fusion": {"voxel_m": 0.1}}  # only the poses matter
-    result = tofuse.reconstruct(recording, coarse)
-    d = result.diagnostics
+    d = tofuse.reconstruct(recording, coarse).diagnostics
     degenerate = {f.index for f in d.frames if len(f.unobservable)}
     assert len(degenerate) >= 6
     assert set(d.accuracy.unbounded) >= degenerate

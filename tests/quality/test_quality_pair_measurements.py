@@ -20,8 +20,7 @@ def test_pairs_measure_true_motion_from_inexact_poses(posed_views) -> None:
         zip(i.tolist(), j.tolist(), strict=True)
     )
     assert (j > i + 1).any()
-    right = graph.with_poses(truth)
-    e = right.residuals()
+    e = graph.with_poses(truth).residuals()
     assert np.median(np.linalg.norm(e[:, :3], axis=1)) < 0.004
     # Six if errors are as large as stated.
     assert np.median(np.einsum("mi,mij,mj->m", e, graph.information, e)) < 12

@@ -189,8 +189,7 @@ def test_cameras_in_info_file(tmp_path: Path, place: str) -> None:
     assert recording.warnings == []
     # 3RScan's depth is PGM.
     for path in (tmp_path / place).glob("*.depth.png"):
-        counts = read_image(path)
-        path.with_suffix(".pgm").write_bytes(pgm_bytes(counts))
+        path.with_suffix(".pgm").write_bytes(pgm_bytes(read_image(path)))
         path.unlink()
     np.testing.assert_array_equal(open_recording(tmp_path / place)[1].depth, frame.depth)
     info.write_text(BUNDLEFUSION_INFO.replace("583 0", "wide 0"))
@@ -202,8 +201,7 @@ def test_camera_of_3dmatch_is_above_its_sequences(tmp_path: Path) -> None:
     make_7scenes(tmp_path / "seq-01")
     (tmp_path / "camera-intrinsics.txt").write_text("572 0 320\n0 573 240\n0 0 1\n")
     for path in (tmp_path / "seq-01", tmp_path):
-        camera = open_recording(path)[0].camera
-        assert camera == Pinhole(640, 480, 572.0, 573.0, 320.0, 240.0)
+        assert open_recording(path)[0].camera == Pinhole(640, 480, 572.0, 573.0, 320.0, 240.0)
 
 
 @pytest.mark.parametrize("color", ["color", "image", "rgb"])
@@ -390,8 +388,7 @@ def test_organised_pcd_with_distortion_has_ray_table(tmp_path: Path) -> None:
     (tmp_path / "b.pcd").write_bytes(pcd_bytes(pcd_points(lens, 2)))
     frame = open_recording(tmp_path)[0]
     assert isinstance(frame.camera, RayTable)
-    measured = np.isfinite(truth).all(-1)
-    np.testing.assert_allclose(frame.points, truth[measured], atol=1e-5)
+    np.testing.assert_allclose(frame.points, truth[np.isfinite(truth).all(-1)], atol=1e-5)
     assert np.isfinite(frame.camera.rays()).all(-1).mean() > 0.85
 
 
@@ -436,8 +433,7 @@ def test_absurd_numbers_in_organised_pcd(tmp_path: Path, value: float, axis: int
         points = pcd_points(CAMERA, 1)
         points.reshape(-1, 3)[:count, axis] = value
         (tmp_path / "a.pcd").write_bytes(pcd_bytes(points))
-        frame = open_recording(tmp_path / "a.pcd")[0]
-        assert (np.abs(frame.points) < 1e9).all()
+        assert (np.abs(open_recording(tmp_path / "a.pcd")[0].points) < 1e9).all()
 
 
 def test_ply_folder(tmp_path: Path) -> None:

@@ -59,8 +59,7 @@ def test_reversed_axes_are_corrected(tmp_path: Path, signs: tuple[int, int, int]
     recording = open_recording(tmp_path / "a")
     assert any("against the pixels" in line for line in recording.warnings)
     z = made.depths()
-    frame = recording[1]
-    np.testing.assert_allclose(frame.points, made.points(z)[1][z[1] > 0], atol=2e-5)
+    np.testing.assert_allclose(recording[1].points, made.points(z)[1][z[1] > 0], atol=2e-5)
 
 
 def test_other_clouds_stay_clouds(tmp_path: Path) -> None:

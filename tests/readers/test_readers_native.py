@@ -143,8 +143,7 @@ def test_depth_beyond_sixteen_bits_is_invalid_and_counted(tmp_path: Path) -> Non
     depth[0, :5] = 6.5535
     writer.add(RangeFrame(0, 0.0, PINHOLE, depth))
     assert writer.out_of_range == 5
-    frame = NativeSource(writer.finish()).read(0)
-    assert len(frame) == 30 * 40 - 5
+    assert len(NativeSource(writer.finish()).read(0)) == 30 * 40 - 5
 
 
 def test_poses_tables_and_correction(tmp_path: Path) -> None:
@@ -353,8 +352,7 @@ def test_rays_override_the_lens(tmp_path: Path) -> None:
     folder = write(tmp_path / "a")
     rays = (PINHOLE.rays() * 2).astype(np.float32)
     np.save(folder / "rays.npy", rays)
-    frame = NativeSource(folder).read(0)
-    np.testing.assert_array_equal(frame.camera.rays(), rays)
+    np.testing.assert_array_equal(NativeSource(folder).read(0).camera.rays(), rays)
 
 
 def test_rays_with_forged_header(tmp_path: Path) -> None:

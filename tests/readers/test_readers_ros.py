@@ -161,8 +161,7 @@ def test_compressed_depth(tmp_path: Path) -> None:
     topic = "/a/depth/image_rect/compressedDepth"
     head = struct.pack("<Iff", 0, 0, 0)
     bag.compressed(topic, 10, head + png_bytes(COUNTS[0]), "16UC1; compressedDepth png")
-    recording = open_recording(bag.close())
-    frame = recording[0]
+    frame = open_recording(bag.close())[0]
     np.testing.assert_allclose(frame.z, COUNTS[0] / 1000, rtol=1e-6)
     # Floats are stored as a / depth + b.
     a, b = 4000.0, -10.0
@@ -229,8 +228,7 @@ def test_infrared_of_same_pixels_is_the_amplitude(tmp_path: Path) -> None:
     recording = open_recording(bag.close())
     assert recording.metadata["amplitude_topic"] == "/camera/ir/image_raw"
     for k, expected in ((0, bright[0]), (1, np.zeros((12, 16))), (2, bright[2])):
-        frame = recording[k]
-        np.testing.assert_array_equal(frame.amplitude_image, expected)
+        np.testing.assert_array_equal(recording[k].amplitude_image, expected)
 
 
 def test_driver_restarted_during_recording(tmp_path: Path) -> None:
@@ -276,8 +274,7 @@ def test_topic_can_be_chosen(tmp_path: Path) -> None:
     assert open_recording(path).metadata["topic"] == "/a/depth/image_raw"
     recording = open_recording(path, topic="/b/depth/image_raw")
     assert recording.warnings == []
-    frame = recording[0]
-    np.testing.assert_allclose(frame.z, COUNTS[1] / 1000, rtol=1e-6)
+    np.testing.assert_allclose(recording[0].z, COUNTS[1] / 1000, rtol=1e-6)
     with pytest.raises(InputError, match=r"has no images or clouds at /c .*/a/depth/image_raw"):
         open_recording(path, topic="/c")
 
@@ -348,8 +345,7 @@ def test_realsense_color_matches_points(tmp_path: Path, kind: str, encoding: str
     for k in (0, 2):
         frame = recording[k]
         check_colors(frame.color_image, expected, off)
-    without = recording[1]
-    assert without.color_image is None
+    assert recording[1].color_image is None
 
 
 def test_realsense_color_with_inverse_distortion(tmp_path: Path) -> None:
@@ -540,8 +536,7 @@ def test_colour_registered_to_depth(tmp_path: Path) -> None:
     bag.image(topic, 10.0, COUNTS[0], "16UC1")
     image = np.ascontiguousarray(color_at(0)[:12, :16])
     bag.image(COLOR_TOPIC, 10.0, image, "rgb8", frame="color", width=16)
-    frame = open_recording(bag.close())[0]
-    np.testing.assert_array_equal(frame.color_image, image)
+    np.testing.assert_array_equal(open_recording(bag.close())[0].color_image, image)
 
 
 def test_colour_without_pose_is_ignored(tmp_path: Path) -> None:
@@ -549,8 +544,7 @@ def test_colour_without_pose_is_ignored(tmp_path: Path) -> None:
     depth_bag(bag)
     bag.image(COLOR_TOPIC, 10.0, color_at(0), "rgb8", frame="color", width=32)
     recording = open_recording(bag.close())
-    frame = recording[0]
-    assert frame.color_image is None
+    assert recording[0].color_image is None
     assert any(f"colour is ignored: the relation of {COLOR_TOPIC}" in w for w in recording.warnings)
 
 

@@ -167,8 +167,7 @@ def test_las_in_feet_is_refused(tmp_path: Path, kind: str) -> None:
             data.header.vlrs.append(known.WktCoordinateSystemVlr(system))
         else:
             keys = struct.pack("<8H", 1, 1, 0, 1, 3076, 0, 1, 9001 if unit == "metre" else 9003)
-            record = laspy.VLR("LASF_Projection", 34735, "", keys)
-            data.header.vlrs.append(record)
+            data.header.vlrs.append(laspy.VLR("LASF_Projection", 34735, "", keys))
         data.write(tmp_path / "a.las")
         if unit == "metre":
             assert len(tofuse.open(tmp_path / "a.las")[0]) == 500

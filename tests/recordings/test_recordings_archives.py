@@ -95,8 +95,7 @@ def test_messages_name_the_archive(tmp_path: Path) -> None:
 
 def test_facts_name_the_archive(room_recording: Path, tmp_path: Path) -> None:
     path = zipped(room_recording, tmp_path / "room.zip")
-    facts = inspect_recording(path, quick=True).facts
-    assert facts["truth"] == str(path / "truth")
+    assert inspect_recording(path, quick=True).facts["truth"] == str(path / "truth")
 
 
 def test_unpacked_files_are_removed_with_the_process(tmp_path: Path) -> None:

@@ -65,8 +65,7 @@ def test_image_is_recovered_from_shuffled_points(lens: str) -> None:
 def test_coordinates_rounded_to_millimetres_suffice() -> None:
     cloud = cloud_of(seen(PINHOLE, 0))
     rounded = CloudFrame.of(np.round(cloud.points, 3))
-    found = find_deprojection([rounded])
-    assert len(found.image(rounded)) == len(rounded)
+    assert len(find_deprojection([rounded]).image(rounded)) == len(rounded)
 
 
 def moved(points: Float32) -> Float32:
@@ -109,8 +108,7 @@ def test_files_of_the_realsense_viewer_are_turned(tmp_path: Path) -> None:
 
 
 def test_real_file_of_the_realsense_viewer(shared_data: Path) -> None:
-    recording = open_recording(shared_data / "cases" / "realsense_viewer")
-    frame = recording[0]
+    frame = open_recording(shared_data / "cases" / "realsense_viewer")[0]
     assert (frame.camera.width, frame.camera.height, len(frame)) == (612, 465, 129601)
     stored = read_ply(shared_data / "cases" / "realsense_viewer" / "45.ply").points
     assert frame.z.max() == np.float32(-stored[:, 2].min())
@@ -135,8 +133,7 @@ def test_folder_of_exported_clouds_is_read_as_images(tmp_path: Path) -> None:
 
 
 def test_cloud_off_the_rays_is_unreadable(tmp_path: Path) -> None:
-    frames = [seen(PINHOLE, k % 5) for k in range(24)]
-    for k, frame in enumerate(frames):
+    for k, frame in enumerate([seen(PINHOLE, k % 5) for k in range(24)]):
         points = moved(frame.points) if k == 4 else frame.points
         write_ply(tmp_path / f"{k:02d}.ply", GeometryRecord(points))
     recording = open_recording(tmp_path)

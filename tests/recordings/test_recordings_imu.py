@@ -72,8 +72,7 @@ def test_gravity_of_native_recordings_and_selections(tmp_path: Path):
     recording = open_recording(folder(tmp_path / "a", columns(np.arange(4) / 10, felt)))
     assert recording.warnings == []
     np.testing.assert_allclose(recording.gravity[:, :3], np.tile(-UP, (4, 1)), atol=1e-9)
-    chosen = recording.select(1, None, 2).gravity
-    assert chosen.shape == (2, 4)
+    assert recording.select(1, None, 2).gravity.shape == (2, 4)
     joined = open_recording(tmp_path / "a", folder(tmp_path / "b", {"strange": np.zeros(3)}))
     assert np.isfinite(joined.gravity).all(1).tolist() == [True] * 4 + [False] * 4
     assert any("gravity is unknown" in warning for warning in joined.warnings)
@@ -92,8 +91,7 @@ def test_simulated_accelerometer_gives_camera_tilt():
     from tofuse.lab.simulation.record import plan
 
     made = plan("room", frames=40)
-    rate = made.sequence.frame_rate_hz
-    times = made.raw / rate
+    times = made.raw / made.sequence.frame_rate_hz
     found = gravity_at(times, accelerations(made.sequence, times[0], times[-1], 0))
     seen = np.einsum("kij,kj->ki", made.poses[:, :3, :3], found[:, :3])
     mean = seen.mean(0) / np.linalg.norm(seen.mean(0))

@@ -326,8 +326,7 @@ def test_scans_that_are_not_read_are_named_with_a_remedy(tmp_path) -> None:
 
 
 def test_recording_pickled_for_another_process_is_opened_there(tmp_path: Path) -> None:
-    folder = write(tmp_path / "a", [1, 2, 3, 4])
-    selected = open_recording(folder, max_depth=3.5)[1::2]
+    selected = open_recording(write(tmp_path / "a", [1, 2, 3, 4]), max_depth=3.5)[1::2]
     copy = pickle.loads(pickle.dumps(selected))
     assert str(copy) == str(selected)
     assert [f.index for f in copy] == [1, 3]

@@ -29,8 +29,7 @@ def made() -> Rig:
 
 def test_round_trip(tmp_path: Path) -> None:
     write_rig(tmp_path / "rig.json", made())
-    read = read_rig(tmp_path / "rig.json")
-    assert read.to_dict() == made().to_dict()
+    assert read_rig(tmp_path / "rig.json").to_dict() == made().to_dict()
     assert json.loads((tmp_path / "rig.json").read_text())["schema"] == 1
 
 

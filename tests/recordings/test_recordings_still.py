@@ -94,8 +94,7 @@ def test_amplitude_reveals_motion_along_flat_wall() -> None:
 def test_identical_and_empty_frames() -> None:
     a = shot(0, scene())
     assert change_between(a, a, MODEL).identical
-    empty = replace(a, depth=np.zeros_like(a.depth))
-    assert not change_between(a, empty, MODEL).still
+    assert not change_between(a, replace(a, depth=np.zeros_like(a.depth)), MODEL).still
     other = RangeFrame(1, 0.0, Pinhole(20, 20, 9, 9, 9, 9), np.ones((20, 20), np.float32))
     assert not change_between(a, other, MODEL).still
 
@@ -131,12 +130,10 @@ def test_clouds_and_unreadable_frames_are_separate() -> None:
 
 
 def test_averaging_reduces_noise_and_sigma() -> None:
-    frames = [shot(k, scene()) for k in range(16)]
-    averaged = average_still(recording_of(frames), MODEL)
+    averaged = average_still(recording_of([shot(k, scene()) for k in range(16)]), MODEL)
     assert len(averaged) == 1
     frame = averaged[0]
-    error = frame.radial_range - scene()
-    assert error.std() == pytest.approx(SIGMA / 4, rel=0.1)
+    assert (frame.radial_range - scene()).std() == pytest.approx(SIGMA / 4, rel=0.1)
     assert np.median(frame.sigma_image) == pytest.approx(SIGMA / 4, rel=0.02)
     assert np.median(MODEL.sigma(frame)) == pytest.approx(SIGMA / 4, rel=0.02)
 
@@ -214,8 +211,7 @@ def test_channels() -> None:
 
 def test_memory_of_long_intervals_is_bounded() -> None:
     frames = [shot(k, scene()) for k in range(60)]
-    averaged = average_still(recording_of(frames), MODEL)
-    frame = averaged[0]
+    frame = average_still(recording_of(frames), MODEL)[0]
     assert np.median(frame.sigma_image) == pytest.approx(SIGMA / np.sqrt(48), rel=0.02)
 
 
@@ -229,8 +225,7 @@ def test_sr4000_corridor(shared_data: Path) -> None:
     first, frame = recording[1], averaged[0]
     both = first.valid & frame.valid
     assert both.mean() > 0.95
-    rays = np.abs(frame.camera.rays() - first.camera.rays())[both]
-    assert np.median(rays) < 2e-4
+    assert np.median(np.abs(frame.camera.rays() - first.camera.rays())[both]) < 2e-4
     # Neighbouring pixels differ less than in any of the four frames.
     rough = [np.median(np.abs(np.diff(f.z, n=2, axis=1))[both[:, 2:]]) for f in (first, frame)]
     assert rough[1] < 0.65 * rough[0]

@@ -326,8 +326,7 @@ def test_views_keep_only_true_error_of_loop(true):
     views, refined = kept(true)
     loop = Loop.longest(RefinedViews(views, refined, OPTIONS))
     assert loop is not None
-    steps = loop.steps(refined.poses)
-    estimate = loop.estimate_by_views(steps, kernels.OFFSET, 0.06)
+    estimate = loop.estimate_by_views(loop.steps(refined.poses), kernels.OFFSET, 0.06)
     assert estimate.errors[kernels.OFFSET] == pytest.approx(true, abs=0.02)
 
 

@@ -113,8 +113,7 @@ def test_nothing_is_found_where_errors_differ_from_view_to_view():
     truth = path(24)
     nothing = fixed_pattern.estimate(views(truth, 0.0), truth, OPTIONS)
     assert nothing.z is None or nothing.z.std() < 0.05 * NOISE
-    rng = np.random.default_rng(7)
-    phases = rng.uniform(0, 2 * np.pi, (24, 2, 1, 1))
+    phases = np.random.default_rng(7).uniform(0, 2 * np.pi, (24, 2, 1, 1))
     turning = 0.005 * np.cos(ACROSS + phases[:, 0]) * np.cos(DOWN + phases[:, 1])
     found = fixed_pattern.estimate(views(truth, turning), truth, OPTIONS)
     assert found.z is None or found.z.std() < 0.2 * turning.std()

@@ -31,8 +31,7 @@ from tofuse.engine.views.prepared_view import prepare_view
 @pytest.fixture(scope="module")
 def swing():
     truth = path(12)
-    kept = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.005)]
-    return kept, truth
+    return [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.005)], truth
 
 
 def test_drift_is_removed_by_joint_refinement(swing):
@@ -214,8 +213,7 @@ def test_pairs_of_a_view_do_not_accumulate_information():
     views = surfaces(truth, noise=0.005)
     known = {}
     for neighbours in (2, 10):
-        part = Joint(neighbours=neighbours)
-        found = refiner(part, views, drifted(truth))
+        found = refiner(Joint(neighbours=neighbours), views, drifted(truth))
         graph = build_graph(range(12), found.poses, found.edges)
         known[neighbours] = (
             len(found.edges),

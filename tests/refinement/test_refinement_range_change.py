@@ -89,8 +89,7 @@ def test_error_of_the_camera_that_differs_over_the_image_is_no_change() -> None:
 def test_sigma_of_serial_errors(correlation: float) -> None:
     # Any two views that share a pair have its error: there are two equal series.
     count, draws = 100, 300
-    rng = np.random.default_rng(0)
-    e = rng.normal(size=(count, draws))
+    e = np.random.default_rng(0).normal(size=(count, draws))
     for k in range(1, count):
         e[k] += correlation * e[k - 1]
     pairs = np.stack([np.arange(count), count + np.arange(count)], 1)

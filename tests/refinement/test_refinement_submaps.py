@@ -50,8 +50,7 @@ def test_submaps_match_refinement_of_all_views(swing) -> None:
 @pytest.mark.nightly
 def test_memory_limit_does_not_change_result(swing, tmp_path: Path) -> None:
     views, truth = swing
-    start = drifted(truth)
-    some = [views[:12], start[:12]]
+    some = [views[:12], drifted(truth)[:12]]
     for submap in (12, 10):
         much = refined(Joint(submap=submap), *some)
         little = refined(Joint(submap=submap), *some, Scratch(200_000, tmp_path))
@@ -60,8 +59,7 @@ def test_memory_limit_does_not_change_result(swing, tmp_path: Path) -> None:
 
 
 def test_places_are_divided_into_equal_parts() -> None:
-    rng = np.random.default_rng(0)
-    places = rng.random((1000, 3)) * [40, 10, 2]
+    places = np.random.default_rng(0).random((1000, 3)) * [40, 10, 2]
     label = partition(places, 300)
     counts = np.bincount(label)
     assert len(counts) == 4

@@ -201,8 +201,7 @@ def test_rotated_model_is_measured_along_its_own_sides(exact, tmp_path):
     axis = rng.integers(0, 3, len(surface))
     surface[np.arange(len(surface)), axis] = rng.choice([-0.5, 0.5], len(surface))
     box = surface * [0.3, 0.4, 0.6]
-    T = se3.exp([0.2, 0, 1, 0, 0.4, 0])
-    points = se3.transform(T, box).astype(np.float32)
+    points = se3.transform(se3.exp([0.2, 0, 1, 0, 0.4, 0]), box).astype(np.float32)
     cloud = Cloud(points, None, None, np.ones(len(points), np.int32))
     got = page(
         tmp_path, lonely(cloud=cloud), ReportExtras("x", truth_points=points if exact else None)
@@ -370,16 +369,14 @@ def test_viewer_mesh_is_simplified():
     shown = unpack(model["points"], "<u2", 3) / 65535 * data["extent"] + data["low"]
     off = shown[:, 2] - (2 + 0.05 * np.sin(6 * shown[:, 0]))
     assert np.abs(off).max() < 0.003
-    triangles = unpack(model["faces"], "<u4", 3)
-    assert triangles.max() == len(shown) - 1
+    assert unpack(model["faces"], "<u4", 3).max() == len(shown) - 1
     assert len(unpack(model["colors"], "u1", 3)) == len(shown) == data["count"]
     assert packed(make_scene(result, rows))["model"]["faces"] is None
 
 
 def test_viewer_contains_model_cameras_and_loops(shown):
     result, extras = room()
-    subject = Subject.of(result, extras)
-    R = subject.R_display_world
+    R = Subject.of(result, extras).R_display_world
     scene = json.loads(shown.scripts[0])
     model = scene["model"]
     points = np.array(scene["low"]) + unpack(model["points"], "<u2", 3) / 65535 * scene["extent"]
@@ -436,8 +433,7 @@ def test_logarithmic_axis_is_linear_near_zero(values, scale):
 
 
 def test_plan_shows_outline_extents_and_path_in_pixels():
-    rng = np.random.default_rng(1)
-    points = rng.uniform(0, 1, (20_000, 3)) * [4, 1, 2]
+    points = np.random.default_rng(1).uniform(0, 1, (20_000, 3)) * [4, 1, 2]
     cameras = np.array([[1.0, 0, 0.5], [2.0, 0, 0.5], [3.0, 0, 0.5]])
     corners = np.array([[0, 0, 0], [4.0, 1, 2]])
     p = plots.model(points, cameras, points, "above", measured=corners, label="a")
@@ -635,8 +631,7 @@ def test_poor_results_give_complete_report(name, tmp_path):
     for section, text in got.sections.items():
         assert len(text.split()) > 4, section
         assert not re.search(r"\b(nan|None|inf)\b", text), section
-    verdict = result.diagnostics.verdict.capitalize()
-    assert f"{verdict}:" in got.sections["verdict"]
+    assert f"{result.diagnostics.verdict.capitalize()}:" in got.sections["verdict"]
 
 
 @pytest.mark.nightly

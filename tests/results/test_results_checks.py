@@ -317,8 +317,7 @@ def test_loop_error_within_expected_drift_is_no_gap() -> None:
 
 
 def test_few_unconstrained_directions_cause_no_drift() -> None:
-    long = evidence(("tracked",) * 21, unheld=(4, 5))
-    assert codes(long) == []
+    assert codes(evidence(("tracked",) * 21, unheld=(4, 5))) == []
     assert codes(evidence(("tracked",) * 21, unheld=(4, 5, 6))) == ["unobserved_motion"]
 
 
@@ -482,8 +481,7 @@ def test_less_than_half_in_main_model_is_failure() -> None:
     e = in_components(apart((4, 6)), apart((7, 8)), frames=9)
     assert codes(e) == ["few_poses", "disconnected"]
     assert judge(e)[1][0].text == "Only 4 of 9 readable frames are in the main model."
-    half = in_components(apart((5, 8)), frames=9)
-    assert codes(half) == ["disconnected"]
+    assert codes(in_components(apart((5, 8)), frames=9)) == ["disconnected"]
 
 
 def test_unconnected_single_frames_are_failure() -> None:
@@ -497,8 +495,7 @@ def test_unconnected_single_frames_are_failure() -> None:
 
 
 def test_component_that_starts_elsewhere_is_no_jump() -> None:
-    there = Component(((5, 8),), np.eye(4), "links")
-    e = in_components(there)
+    e = in_components(Component(((5, 8),), np.eye(4), "links"))
     moved = e.sequential.copy()
     moved[5:] = se3.exp(np.array([3.0, 0, 0, 0, 1, 0])) @ moved[5:]
     assert "jumped" not in codes(replace(e, sequential=moved))

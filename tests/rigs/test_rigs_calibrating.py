@@ -116,8 +116,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert len(times) == 2
     assert np.allclose(poses, np.eye(4))
     _, of_images = read_tum(tmp_path / "model" / "trajectory.txt")
-    stated = read_rig(out).cameras
-    assert np.allclose(of_images[1], stated[1].T_rig_camera, atol=1e-9)
+    assert np.allclose(of_images[1], read_rig(out).cameras[1].T_rig_camera, atol=1e-9)
     # Its accuracy is that of the rig, not that of one camera jumping from place to place.
     run_json = json.loads((tmp_path / "model" / "run.json").read_text())
     assert run_json["verdict"] == "good"
@@ -165,8 +164,7 @@ def test_recordings_of_rig_are_opened_again(tmp_path: Path) -> None:
     opening = Opening(tuple(folder / name for name in names), tmp_path / "rig.json")
     again = Opening.from_dict(opening.to_dict(), "run.json")
     assert again == opening
-    recording = again.open()
-    assert recording.metadata["cameras"] == list(names)
+    assert again.open().metadata["cameras"] == list(names)
     with pytest.raises(InputError, match=r"has 2 cameras .* 1 recordings are given"):
         replace(opening, paths=opening.paths[:1]).open()
     write_rig(tmp_path / "rig.json", Rig(tuple(rows), unplaced={"top": "too dark"}))

@@ -15,8 +15,7 @@ from tofuse.engine.stored_views.view_store import SampledView
 def test_surfaces_agree_better_than_under_reference_poses(shared_data) -> None:
     folder = shared_data / "azure_kinect_rig"
     # Three of the five, to save time.
-    paths = sorted(p for p in folder.iterdir() if p.is_dir())[:3]
-    cameras = open_cameras(paths)
+    cameras = open_cameras(sorted(p for p in folder.iterdir() if p.is_dir())[:3])
     rig = calibrate_cameras(cameras).rig
     assert not rig.unplaced
     reference = json.loads((folder / "reference_T_world_camera.json").read_text())

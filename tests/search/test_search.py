@@ -48,8 +48,7 @@ def random_image(rng, shape=(9, 12)):
     rays = np.dstack([x - 0.6, y - 0.4, np.ones(shape)])
     normals = np.dstack([rng.normal(0, 0.2, (*shape, 2)), np.ones(shape)])
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    depth = rng.uniform(1.5, 2.5, shape)
-    grid = np.dstack([normals, (normals * rays).sum(-1) * depth])
+    grid = np.dstack([normals, (normals * rays).sum(-1) * rng.uniform(1.5, 2.5, shape)])
     kind = rng.random(shape)
     grid[kind < 0.1] = 0
     grid[kind > 0.85, :3] = 0

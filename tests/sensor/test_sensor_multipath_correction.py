@@ -71,8 +71,7 @@ def test_correction_depends_on_ratio_of_amplitude_and_gain_only(corner: Seen) ->
 
 def test_flat_wall_is_unchanged() -> None:
     rng = np.random.default_rng(0)
-    wall = Seen(WALL)
-    image = wall.image
+    image = Seen(WALL).image
     noisy = image.z * (1 + 0.003 * rng.normal(size=image.z.shape).astype(np.float32))
     for z in (image.z, noisy):
         found = REFLECTIONS.solve(replace(image, z=z), GAIN)
@@ -213,8 +212,7 @@ def test_multipath_of_simulated_corner_is_reduced(texture: bool, share: float) -
     for k in (0, 30):
         rendered = render(plan.scene, plan.sequence, plan.model, k, effects=plan.effects)
         frame = rendered.frame
-        image = tof_image(frame)
-        assert image is not None
+        assert tof_image(frame) is not None
         fixed = corrector.apply(frame)
         assert isinstance(fixed, RangeFrame)
         seen = frame.valid & (rendered.depth > 0)

@@ -34,8 +34,7 @@ def measured(own: np.ndarray, fractions: tuple[float, ...]) -> np.ndarray:
 
 
 def frames(fractions: tuple[float, ...], sigma: float, count: int = 14) -> np.ndarray:
-    rng = np.random.default_rng(1)
-    noise = rng.normal(0, sigma, (2, count, ROWS, COLUMNS))
+    noise = np.random.default_rng(1).normal(0, sigma, (2, count, ROWS, COLUMNS))
     clean = np.stack([measured(own_light(k), fractions) for k in range(count)])
     return clean + noise[0] + 1j * noise[1]
 

@@ -38,8 +38,7 @@ def periods_of(frame: RangeFrame, radial: np.ndarray) -> tuple[np.ndarray, np.nd
 def test_hall_beyond_period_is_unwrapped() -> None:
     """8 x 8 m before a camera with a period of 5 m: most of it is wrapped."""
     frames = taken("hall", 90)
-    part = Unwrap().fit([frame for frame, _ in frames])
-    corrector = part.start()
+    corrector = Unwrap().fit([frame for frame, _ in frames]).start()
     wrapped = restored = good = harmed = 0
     for frame, radial in frames:
         lacks, sure = periods_of(frame, radial)

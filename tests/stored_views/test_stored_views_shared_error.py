@@ -77,8 +77,7 @@ def test_sums_of_patches_match_normal_equations(pair):
     R = response / np.sqrt(np.maximum(sums[:, :1], 1e-12))
     assert np.linalg.eigvalsh(H[:6, :6] - R.T @ R).min() > -1e-6 * np.trace(H)
     middle = len(source.points) // 2
-    single = source.with_points(np.s_[middle : middle + 1])
-    one, row = sums_of(single, target, T)
+    one, row = sums_of(source.with_points(np.s_[middle : middle + 1]), target, T)
     H, g = unpack(row)
     (k,) = np.flatnonzero(one[:, kernels.PATCH_WEIGHT])
     weight, r, J = one[k, 0], one[k, 1] / one[k, 0], one[k, 2:] / one[k, 0]
@@ -193,8 +192,7 @@ def test_a_pair_whose_sums_are_not_finite_says_nothing(pair):
     points = source.points.copy()
     points[len(points) // 2, 3:6] = np.inf  # the normal of a plane that was fitted to mere noise
     views = [target, source, replace(source, points=points)]
-    pairs = np.array([(0, 1), (0, 2)])
-    state = DirectedPairs.of(views, pairs, RefineOptions())
+    state = DirectedPairs.of(views, np.array([(0, 1), (0, 2)]), RefineOptions())
     fixed = np.ones(kernels.ERRORS, np.int64)
     state.evaluate(np.stack([np.eye(4), T, T]), np.zeros(kernels.ERRORS), fixed, Round(1, 0.0, 0.0))
     is_noise = (state.source == 2) & (state.target == 0)

@@ -96,8 +96,7 @@ def test_most_similar_keyframe_is_found(around) -> None:
         near = surface(seen(T @ se3.exp([0.02, 0, 0, 0, 0.05, 0]), 9))
         assert keyframes.most_similar(near, 9).view.index == k
         # Excluding keyframes of its own component.
-        other = keyframes.most_similar(near, k // 3)
-        assert other.component != k // 3
+        assert keyframes.most_similar(near, k // 3).component != k // 3
     only = KeyframeMap(0.2, 0.1)
     assert only.most_similar(VIEW, 0) is None
     only.add(along(0.0, 0, 2))
@@ -158,8 +157,7 @@ def test_newest_and_most_similar_keyframes_are_searched(around, monkeypatch) -> 
     relocalizer().links(lost, keyframes, 1)
     assert [j for _, j in asked] == [1]
     asked.clear()
-    last = surface(seen(at(0, 0.3, 3.52), 7))
-    relocalizer().links(last, keyframes, 2)
+    relocalizer().links(surface(seen(at(0, 0.3, 3.52), 7)), keyframes, 2)
     assert [j for _, j in asked] == [5]
 
 

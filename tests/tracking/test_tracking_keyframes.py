@@ -270,8 +270,7 @@ def test_jump_away_and_back_gives_three_components(corner, elsewhere, searches):
 
 def test_degenerate_directions_are_reported():
     """A flat wall without albedo does not constrain motion within its plane."""
-    wall = Sequence("wall", range(0, 12, 3), False)
-    frames = unlit(wall.frames)
+    frames = unlit(Sequence("wall", range(0, 12, 3), False).frames)
     for lost in ((), (1,)):
         steps = run([scaled(f, 0) if k in lost else f for k, f in enumerate(frames)])
         assert components(steps) == [None if k in lost else 0 for k in range(4)]
@@ -310,8 +309,7 @@ def test_real_camera_after_large_move_is_correct_or_doubtful(shared_data):
         assert np.linalg.norm(step.T_component_camera[:3, 3]) < 0.01
     assert len(steps) == 8
     moved = steps[4]
-    distance = moved.T_component_camera[2, 3]
-    correct = distance == pytest.approx(0.305, abs=0.02)
+    correct = moved.T_component_camera[2, 3] == pytest.approx(0.305, abs=0.02)
     assert moved.reason
     assert moved.component != 0 or moved.doubtful or correct
     certain = [link.T_i_j[2, 3] for link in moved.links if link.certain]

@@ -160,8 +160,7 @@ def test_gate_widens_with_frame_interval(seconds, usual) -> None:
     """0.2 m: the displacement by 3 m/s^2 in 0.37 s."""
     poses = walk(8)
     when = counted if seconds is None else timed(1 / seconds)
-    motion = followed(poses[:7], when)
-    words = motion.gate_violation(elsewhere(poses[7], 0.2), when(7))
+    words = followed(poses[:7], when).gate_violation(elsewhere(poses[7], 0.2), when(7))
     assert (words == "") == usual
 
 

@@ -75,8 +75,7 @@ def with_box(frame, centre, half, noise, seed):
 
 def trajectory(motion, cover, frame):
     """Centres (n, 3) in the camera's frame and half sides (3,) of a box of part of the image."""
-    rays = frame.camera.rays()
-    area = np.prod(np.ptp(rays.reshape(-1, 2), axis=0))
+    area = np.prod(np.ptp(frame.camera.rays().reshape(-1, 2), axis=0))
     side = np.sqrt(cover * area) * NEAR / 2
     t = np.linspace(0, 1, FRAMES)[:, None]
     start, end = {

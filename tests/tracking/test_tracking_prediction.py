@@ -78,8 +78,7 @@ def test_degenerate_directions_are_excluded() -> None:
     motions = around_a_mean(np.random.default_rng(7), 300)
     motions[:, 1] = 0.02
     poses = path(motions * [1, 1, 1, 0, 0, 0])
-    weak = np.eye(6)[1:2]
-    found = Prediction.of(poses, [weak] * len(poses))
+    found = Prediction.of(poses, [np.eye(6)[1:2]] * len(poses))
     ignored = Prediction.of(poses, [NONE] * len(poses))
     assert found.sigma[0] == pytest.approx(ignored.sigma[0] * np.sqrt(3 / 2), rel=1e-3)
 

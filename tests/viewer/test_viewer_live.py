@@ -115,8 +115,7 @@ def test_live_view_grows_and_does_not_change_result(room_recording, tmp_path, br
         place = address(server)
         with watched(browser, place, ours=place, viewport={"width": 700, "height": 460}) as seen:
             seen.page.get_by_text("writing").wait_for(timeout=30_000)
-            growing = drawn(seen)
-            assert len(np.unique(growing.reshape(-1, 3), axis=0)) > 100
+            assert len(np.unique(drawn(seen).reshape(-1, 3), axis=0)) > 100
             live.finish("http://127.0.0.1:1")
             seen.page.get_by_role("link", name="The report").wait_for(timeout=30_000)
             seen.check()

@@ -57,16 +57,14 @@ def inside(view: PreparedView, margin=4):
 @pytest.mark.parametrize("amplitude", ["raw", "range_compensated", "ir", None])
 def test_noise_is_estimated_from_view(sigma, amplitude):
     view = prepare_view(wall(sigma=sigma, amplitude=amplitude), OPTIONS)
-    found = np.median(view.sigma[view.sigma > 0])
-    assert found == pytest.approx(sigma, rel=0.15)
+    assert np.median(view.sigma[view.sigma > 0]) == pytest.approx(sigma, rel=0.15)
 
 
 @pytest.mark.parametrize("amplitude", ["raw", "range_compensated"])
 def test_noise_is_larger_at_low_amplitude(amplitude):
     frame = wall(sigma=0.004, amplitude=amplitude, spread=0.5)
     view = prepare_view(frame, OPTIONS)
-    clean = wall(sigma=0.0, amplitude=amplitude, spread=0.5)
-    off = (frame.z - clean.z) / view.sigma
+    off = (frame.z - wall(sigma=0.0, amplitude=amplitude, spread=0.5).z) / view.sigma
     raw = wall(amplitude="raw", spread=0.5).amplitude_image
     for part in (raw < np.quantile(raw, 0.3), raw > np.quantile(raw, 0.7)):
         assert off[part].std() == pytest.approx(1, rel=0.15)
@@ -204,8 +202,7 @@ def test_frame_of_invalid_values_is_prepared():
     sigma = rng.choice([0, -1, 1.0, 1e-30, 1e30, np.inf, np.nan], (72, 88)).astype(np.float32)
     base = RangeFrame(0, 0.0, CAMERA, depth.astype(np.float32), amplitude_image=light)
     for frame in (base, replace(base, sigma_image=sigma)):
-        view = prepare_view(frame, OPTIONS)
-        assert np.isfinite(view.planes).all()
+        assert np.isfinite(prepare_view(frame, OPTIONS).planes).all()
 
 
 def test_result_is_independent_of_threads():
