@@ -122,7 +122,7 @@ class Source(Command):
     format : F
         input format, if not recognised
     camera : FILE
-        use this camera.json instead of the recording's own
+        camera.json to use instead of the recording's own, or lens by OpenCV, ROS, ...
     topic : T
         topic of a ROS bag, if the default is wrong
     """

@@ -72,8 +72,8 @@ def likely_up(mesh: Mesh | None, poses: Float64) -> Float64:
 
     Handheld cameras have a level horizon (by which panoramas are straightened: Brown and Lowe 2007,
     section 5), any pitch, and turn more than they nod; some are permanently on their side or upside
-    down. Man-made surfaces are horizontal or vertical, and horizontal ones are mostly seen from above, as floors
-    and tables.
+    down. Man-made surfaces are horizontal or vertical, and horizontal ones are mostly seen from
+    above, as floors and tables.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from tofuse.engine.bounds import Bounds
 from tofuse.engine.errors import InputError, UnreadableFrameError, signals_as_themselves
 from tofuse.engine.frames import NOISE_MODEL, CloudFrame, Frame, RangeFrame, Recording, Source
 from tofuse.engine.parts import check_number, discover, name_of, registered
-from tofuse.formats.cameras import read_noise
+from tofuse.formats.cameras import camera_file, read_noise
 from tofuse.formats.files import reading
 from tofuse.formats.geometry import is_surface, read_surface, surface_points
 from tofuse.formats.poses import TimedPoses, read_poses
@@ -139,12 +139,14 @@ def open_recording(
         return Recording.of(cameras, shown_path, "rig", again)
     for path in inner:
         _check_kind(path)
-    located = [item for path in inner for item in _resolve(path, format)]
+    located = [item for path in inner for item in _resolve(path, format, options)]
     sources = [_opened(item, options) for item in located]
     source: Source = sources[0]
     if len(sources) > 1:
         source = JoinedSource(sources, _short_names([item.path for item in located]))
     _check_usable(source, paths[0])
+    if assumption := camera_file.assumption(options.camera):
+        source.warnings.append(assumption)
     if len(inner) == 1:
         _read_noise(source, inner[0])
     if min_depth is not None or max_depth is not None:
@@ -172,7 +174,7 @@ def _rig_source(
                 where=rig_file.parent,
                 remedy=f"put it into {path}, or remove the camera from {rig_file.name}",
             )
-        located = _resolve(path, format)
+        located = _resolve(path, format, options)
         if len(located) > 1:
             raise InputError("contains several recordings", where=path, remedy="leave one")
         source = _opened(located[0], options)
@@ -218,7 +220,11 @@ def _check_kind(path: Path) -> None:
         )
 
 
-def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
+def _resolve(
+    path: Path,
+    format: str | None,  # noqa: A002
+    options: ReaderOptions,
+) -> list[_Located]:
     """The recordings at a path, each with its reader."""
     try:
         path.stat()
@@ -231,7 +237,7 @@ def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
         raise InputError("is an empty folder", where=path, remedy="pass a recording")
     if format is not None:
         return _resolve_as(path, format)
-    sniffs = _sniff(path)
+    sniffs = _sniff(path, options)
     # A camera.json or names of one format outweigh a cloud in the same folder.
     best = max((sniff.confidence for sniff in sniffs.values()), default=0.0)
     confident = {
@@ -258,7 +264,7 @@ def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
     if not sniffs and (parts := _recordings_in(path)):
         return parts
     if not sniffs and len(children) == 1 and reading.is_folder(children[0]):
-        return _resolve(children[0], format)
+        return _resolve(children[0], format, options)
     suffixes = {p.suffix.lower() for p in (children or [path]) if p.is_file()}
     if suffixes and suffixes <= _ARCHIVES:
         raise InputError(
@@ -301,9 +307,12 @@ def _sniff_as(reader: Reader, path: Path) -> Sniff | None:
         return None
 
 
-def _sniff(path: Path) -> dict[str, Sniff]:
-    sniffs = {name: _sniff_as(reader, path) for name, reader in readers().items()}
-    return {name: sniff for name, sniff in sniffs.items() if sniff is not None}
+def _sniff(path: Path, options: ReaderOptions | None = None) -> dict[str, Sniff]:
+    found = {name: _sniff_as(reader, path) for name, reader in readers().items()}
+    sniffs = {name: sniff for name, sniff in found.items() if sniff is not None}
+    if options is None or options.camera is None:
+        return sniffs
+    return {name: sniff.with_camera() for name, sniff in sniffs.items()}
 
 
 def _is_sure(path: Path) -> bool:
