@@ -254,7 +254,8 @@ def register_clouds(
         registration = _registered_scaled(source, target, scale, rng)
         if registration is not None:
             reason = f"the views fit with the source {scale:.4g} times as large: check its unit"
-            return replace(registration, believed=False, reason=reason)
+            remedy = f"the source at that scale (--factor {scale:.9g}; in Python scale=...)"
+            return replace(registration, believed=False, reason=reason, remedy=remedy)
     try:
         views = _CloudViews.of(source, target, rng)
         return _registered(views, guess, image_registration, always_search=always_search)
