@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import pickle
 import re
+import shutil
 import threading
 import time
 from dataclasses import replace
@@ -203,6 +204,34 @@ def test_depth_in_openexr_is_in_metres(tmp_path: Path) -> None:
     frame = open_recording(folder)[0]
     assert (frame.depth[1:] == 1.25).all()
     assert not frame.depth[0, :2].any()
+
+
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        (["scan.glb"], r"is a model, not a recording; .*`tofuse register` and"),
+        (["a.obj", "a.mtl", "a.jpg"], "is a model, not a recording"),
+        (["IMG_1.MOV"], "is a video, without depth"),
+        (["1.jpg", "2.HEIC"], "is of photos, without depth"),
+    ],
+)
+def test_exports_without_depth_are_named(tmp_path: Path, names: list[str], says: str) -> None:
+    """What people get who choose the wrong entry in the menu of their app."""
+    for name in names:
+        (tmp_path / name).write_bytes(b"abc")
+    for path in [tmp_path, tmp_path / names[0]]:
+        if len(names) == 1 or path == tmp_path:
+            with pytest.raises(InputError, match=says):
+                open_recording(path)
+    # Colour of a recording leads to its folder.
+    folder = write(tmp_path / "r", [1])
+    (folder / "0.jpg").write_bytes(b"abc")
+    with pytest.raises(InputError, match="pass the recording's folder"):
+        open_recording(folder / "0.jpg")
+    shutil.rmtree(folder)
+    (tmp_path / "unknown").mkdir()
+    with pytest.raises(InputError, match="known format: it contains .* folder"):
+        open_recording(tmp_path)
 
 
 def test_limits_of_depth(tmp_path: Path) -> None:

@@ -47,6 +47,26 @@ CLOSED = {
     ),
 }
 
+# What is exported instead of a recording: problem, remedy, and suffixes of files.
+_NO_DEPTH = (
+    (
+        "is a model, not a recording",
+        "export the depth images of which it was made (of phones: docs/iphone.md); `tofuse "
+        "register` and `tofuse compare` take models",
+        {".obj", ".mtl", ".stl", ".glb", ".gltf", ".usdz", ".usd", ".fbx", ".dae", ".off"},
+    ),
+    (
+        "is a video, without depth",
+        "export the recording with its depth images (of phones: docs/iphone.md)",
+        {".mov", ".mp4", ".m4v", ".avi", ".webm"},
+    ),
+    (
+        "is of photos, without depth",
+        "export the depth images, too (of phones: docs/iphone.md)",
+        {".jpg", ".jpeg", ".heic", ".dng", ".webp"},
+    ),
+)
+
 _ARCHIVES = {".zip", ".tar", ".gz", ".tgz", ".7z", ".rar"}
 
 # A single file of these, which contain a whole recording, is that of its folder.
@@ -61,7 +81,7 @@ _REMEDIES = {
 }
 
 # A folder with these may contain depth images of an unknown camera.
-_IMAGES = (".png", ".pgm", ".tif", ".tiff", ".jpg", ".jpeg")
+_IMAGES = (".png", ".pgm", ".tif", ".tiff")
 
 
 def readers() -> dict[str, Reader]:
@@ -274,6 +294,11 @@ def _resolve(
         )
     for suffix in suffixes & CLOSED.keys():
         problem, remedy = CLOSED[suffix]
+        raise InputError(problem, where=path, remedy=remedy)
+    exported = set[str]().union(*(kind for _, _, kind in _NO_DEPTH))
+    alone = not (sniffs or _folders_in(path) or _is_sure(path.absolute().parent))
+    if alone and suffixes and suffixes <= exported:
+        problem, remedy = next((p, r) for p, r, kind in _NO_DEPTH if kind & suffixes)
         raise InputError(problem, where=path, remedy=remedy)
     raise _unidentified(path, sniffs, children)
 
