@@ -230,8 +230,21 @@ def test_exports_without_depth_are_named(tmp_path: Path, names: list[str], says:
         open_recording(folder / "0.jpg")
     shutil.rmtree(folder)
     (tmp_path / "unknown").mkdir()
-    with pytest.raises(InputError, match="known format: it contains .* folder"):
+    with pytest.raises(InputError, match=r"known format: it contains .* folder"):
         open_recording(tmp_path)
+
+
+def test_file_passed_for_a_format_may_have_any_suffix(tmp_path: Path) -> None:
+    table = tmp_path / "points.csv"
+    table.write_text("x,y,z\n" + "1,2,3\n" * 12)
+    with pytest.raises(InputError, match="or use format xyz for a single one"):
+        open_recording(table)
+    assert len(open_recording(table, format="xyz")[0]) == 12
+    write_ply(tmp_path / "a.ply", GeometryRecord(np.ones((3, 3))))
+    (tmp_path / "a.ply").rename(tmp_path / "a.dat")
+    assert len(open_recording(tmp_path / "a.dat", format="ply")[0]) == 3
+    with pytest.raises(InputError, match="is not a PLY file"):
+        open_recording(table, format="ply")
 
 
 def test_limits_of_depth(tmp_path: Path) -> None:

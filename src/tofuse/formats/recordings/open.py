@@ -74,8 +74,11 @@ _CONTAINERS = (".bag", ".db3", ".mcap", ".mkv", ".sens", ".r3d", ".npz", ".h5", 
 # What to do with files that are not read, by suffix.
 _REMEDIES = {
     **dict.fromkeys(
-        (".txt", ".csv"), "if the lines are x y z of a cloud, rename the files to .xyz"
+        (".txt", ".csv"),
+        "if the lines are x y z of a cloud, rename the files to .xyz, or use --format xyz "
+        "for a single one",
     ),
+    ".npz": "name its arrays depth, K and, for whole numbers, depth_unit_m (docs/formats.md)",
     ".npy": "save depth and K by numpy.savez, or put a file for each image into depth/ beside a "
     "camera.json (docs/formats.md)",
 }
