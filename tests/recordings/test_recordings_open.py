@@ -172,11 +172,24 @@ def test_folder_of_images_needs_only_a_camera(tmp_path: Path) -> None:
     assert recording.format == "depth-png"
     assert depths(recording) == [1, 3]
     assert recording.timestamps.tolist() == [5.0, 5.5]
-    with pytest.raises(InputError, match=r"2 16-bit PNGs; .* use camera=camera\.json"):
+    says = r"has 2 PNGs, of depth among them; .* use camera=camera\.json"
+    with pytest.raises(InputError, match=says):
         open_recording(bare)
+    # Colour in between is left out, and a folder with them may be passed.
+    for k in range(2):
+        write_png(bare / f"{k:06d}-c.png", np.full((60, 80, 3), 9, np.uint8))
+    (bare / "000001.png").write_bytes(b"cut off")
+    (tmp_path / "all" / "rgb").mkdir(parents=True)
+    bare = bare.rename(tmp_path / "all" / "scan")
+    recording = open_recording(tmp_path / "all", camera=lens)
+    assert recording.format == "depth-png"
+    assert len(recording) == 2
+    assert depths(recording[:1]) == [1]
+    assert any("2 images without 16-bit depth left out" in text for text in recording.warnings)
+    with pytest.raises(InputError, match=r"if the depth images are in scan/, use camera="):
+        open_recording(tmp_path / "all")
     # A format with names of its own comes first.
-    for k, file in enumerate(sorted(bare.glob("*.png"))):
-        file.rename(bare / f"depth{k}.png")
+    (bare / "000000.png").rename(bare / "depth0.png")
     assert open_recording(bare, camera=lens).format == "pairs"
 
 

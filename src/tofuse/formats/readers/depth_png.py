@@ -18,6 +18,8 @@ _CAMERA = (
     "or a file of OpenCV or ROS"
 )
 
+_SAMPLES = 16  # number of images that tell whether a folder has depth
+
 
 @part("reader", "depth-png")
 class DepthPng(Reader):
@@ -28,19 +30,22 @@ class DepthPng(Reader):
         files = inputs.files_at(path, ".png")
         if not files or _is_native(path):
             return None
-        nothing = InputError("has no images", where=path)
-        header = reading.first_readable(files, read_header, nothing)
-        if header.bits != 16 or header.channels != 1:
-            return None
         if reading.is_file(path):
-            return Sniff(Sniff.CERTAIN, "a 16-bit PNG")
-        evidence = f"{quantities.count(len(files), '16-bit PNG')}"
+            return Sniff(Sniff.CERTAIN, "a 16-bit PNG") if _is_depth(path) else None
+        # Colour may lie in between, in any order.
+        sampled = files[:: -(-len(files) // _SAMPLES)]
+        if not any(_is_depth(file) for file in sampled):
+            return None
+        evidence = f"{quantities.count(len(files), 'PNG')}, of depth among them"
         # Formats with names of their own come first.
         return Sniff(Sniff.UNCERTAIN / 2, evidence, _CAMERA, needs_camera=True)
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        files = inputs.required(inputs.files_at(path, ".png"), ".png of depth", path)
+        images = inputs.files_at(path, ".png")
+        files = inputs.required(
+            [f for f in images if _is_depth(f) is not False], "16-bit .png", path
+        )
         folder = path.parent if reading.is_file(path) else path
         camera = options.camera
         if camera is None and reading.is_file(folder / "camera.json"):
@@ -51,7 +56,21 @@ class DepthPng(Reader):
         source = DepthImageSource(files, times, None, options=ReaderOptions(camera))
         if reading.is_folder(path):
             source.read_sidecars(path)
+        if len(files) < len(images):
+            others = quantities.count(len(images) - len(files), "image")
+            source.warnings.append(
+                f"{others} without 16-bit depth left out; colour is used from color/ beside depth/"
+            )
         return source
+
+
+def _is_depth(file: Path) -> bool | None:
+    """Whether an image has one channel of 16 bits; None if it can't be read: a frame less, then."""
+    try:
+        header = read_header(file)
+    except InputError:
+        return None
+    return header.bits == 16 and header.channels == 1
 
 
 def _remedy(path: Path) -> str:

@@ -42,7 +42,6 @@ class Kinect2(Reader):
             Sniff.UNCERTAIN,
             f"{len(files)} *_depth.png but no calibration",
             "put kinect2_bridge's calib_ir.yaml and calib_color.yaml into the same folder",
-            needs_camera=True,
         )
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:

@@ -284,7 +284,7 @@ def _resolve(
             where=path,
             remedy=f"use --format {' or '.join(confident)}",
         )
-    if not sniffs and (parts := _recordings_in(path)):
+    if not sniffs and (parts := _recordings_in(path, options)):
         return parts
     if not sniffs and len(children) == 1 and reading.is_folder(children[0]):
         return _resolve(children[0], format, options)
@@ -353,12 +353,12 @@ def is_recording(path: Path) -> bool:
     return any(sniff.confidence >= Sniff.CERTAIN for sniff in _sniff(path).values())
 
 
-def _recordings_in(path: Path) -> list[_Located]:
+def _recordings_in(path: Path, options: ReaderOptions) -> list[_Located]:
     """The recordings in a folder, if any; InputError if there are several that can't be joined."""
     format_of: dict[Path, str] = {}
     best = 0.0
     for part in [*_folders_in(path), *inputs.files_at(path, *_CONTAINERS)]:
-        sniffs = _sniff(part)
+        sniffs = _sniff(part, options)
         confident = [name for name, s in sniffs.items() if s.confidence >= Sniff.CERTAIN]
         if confident:
             format_of[part] = max(confident, key=lambda name: sniffs[name].confidence)
@@ -398,6 +398,11 @@ def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) ->
         remedy = _REMEDIES.get(most.lower(), remedy)
         if any(kind.lower() in _IMAGES for kind in kinds):
             remedy = "if these are depth images, move them to depth/ in it and add a camera.json"
+        for child in _folders_in(path):
+            if any(sniff.needs_camera for sniff in _sniff(child).values()):
+                remedy = f"if the depth images are in {child.name}/, use --camera camera.json "
+                remedy += "(docs/formats.md), or a file of OpenCV or ROS"
+                break
     elif path.stat().st_size == 0:
         return InputError("is empty", where=path, remedy="copy the file again")
     else:
