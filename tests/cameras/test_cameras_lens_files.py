@@ -151,6 +151,14 @@ def test_layouts_of_other_programs(tmp_path: Path, name: str) -> None:
     assert load_camera(tmp_path / name)[1] == expected
 
 
+def test_damaged_camera_json_is_called_that(tmp_path: Path) -> None:
+    path = written(tmp_path, "mine.json", '{"schema": 1, "model": "pinhole", "fx": 1')
+    with pytest.raises(InputError, match="JSON"):
+        load_camera(path)
+    with pytest.raises(InputError, match="no schema, and is no camera"):
+        load_camera(written(tmp_path, "b.json", '{"model": "pinhole", "fx": 1}'))
+
+
 @pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
 def test_distortion_in_one_dimension_is_read(tmp_path: Path, suffix: str) -> None:
     """OpenCV writes an array (5,) unlike one of (1, 5), and wraps long lines."""

@@ -172,8 +172,8 @@ def _import_lens(arguments: Calibrate) -> Summary:
         metadata = recording_fields(recording)
     else:
         metadata = {"depth_unit_m": lens_file.depth_unit_m, "depth_kind": lens_file.depth_kind}
-        if lens_file.assumed:
-            warnings.append(f"{lens_file.assumed}, or pass --recording to take it from a recording")
+        if assumption := camera_file.assumption(arguments.inputs[0]):
+            warnings.append(f"{assumption}, or pass --recording to take it from a recording")
     fields = camera_file.camera_fields(camera)
     lines = [f"{name} {value}" for name, value in fields.items()]
     lines.append(f"read as a file of {lens_file.program}")

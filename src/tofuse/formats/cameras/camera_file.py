@@ -42,7 +42,6 @@ AMPLITUDE_KINDS = ("raw", "range_compensated", "ir")
 _FOREIGN = "correct it, or convert a file of another program by `tofuse calibrate import`"
 _MAX_BYTES = 64 << 20
 _METRES = "the metres of one count, such as 0.001"
-_NAME = "camera.json"
 # Of a JSON object that is meant for a camera.json.
 _OWN = {"schema", "model"}
 _LENS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
@@ -84,8 +83,6 @@ class CameraFile:
         Unknown keys.
     program
         Of a file of another program its `LensFile.format`; None for a camera.json.
-    assumed
-        What such a file does not state of depth, for a warning.
     """
 
     camera: Pinhole | None
@@ -104,7 +101,6 @@ class CameraFile:
     color: ColorCamera | None = None
     unknown: tuple[str, ...] = ()
     program: str | None = None
-    assumed: str = ""
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -117,9 +113,7 @@ class CameraFile:
         return {name: value for name, value in values.items() if value is not None}
 
 
-_KEYS = {field.name for field in fields(CameraFile)} - {
-    *("camera", "size", "unknown", "program", "assumed")
-}
+_KEYS = {field.name for field in fields(CameraFile)} - {*("camera", "size", "unknown", "program")}
 
 
 def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
@@ -174,8 +168,7 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
 def read_lens_file(path: str | Path, size_of_images: SizeOf | None = None) -> CameraFile:
     """Read the camera of depth from a calibration file of another program.
 
-    What it does not state of depth is z in mm, which `CameraFile.assumed` says. For the rest see
-    `parse_lens_file`.
+    What it does not state of depth is z in mm, see `assumption`; the rest is `parse_lens_file`.
 
     Parameters
     ----------
@@ -205,35 +198,35 @@ def read_lens_file(path: str | Path, size_of_images: SizeOf | None = None) -> Ca
     camera = checked_lens(MODELS[lens.model], (width, height), values, path)
     get = _Fields({"depth_unit_m": lens.depth_unit_m, "depth_kind": lens.depth_kind}, str(path))
     unit, kind = get.depth_unit(), get.choice("depth_kind", ("z", "range"))
-    missing = {
-        "whole numbers of depth are mm (depth_unit_m)": unit,
-        "depth is z (depth_kind)": kind,
-    }
-    assumed = " and ".join(field for field, value in missing.items() if value is None)
     return CameraFile(
         camera,
         (width, height),
         unit or 0.001,
         kind or "z",  # type: ignore[arg-type]
         program=lens.format,
-        assumed=f"it is assumed that {assumed}; if not, add that key to {path}" if assumed else "",
     )
 
 
-def _description(path: Path, size_of_images: SizeOf | None) -> CameraFile:
-    """The content of a camera.json, or of a file of another program that states as much."""
-    text = reading.read_text(path, limit=_MAX_BYTES)
+def _is_own(path: Path) -> bool:
+    """Whether a file is meant for a camera.json, not of another program."""
     data: Any = None
     with suppress(InputError):
-        data = reading.parse_json(text, path)
-    if (data is None and path.name != _NAME) or (data and not _OWN & data.keys()):
-        return read_lens_file(path, size_of_images)
-    return read_camera_file(path)
+        data = reading.parse_json(reading.read_text(path, limit=_MAX_BYTES), path)
+    return path.suffix.lower() == ".json" if data is None else bool(_OWN & data.keys())
 
 
-def assumption(path: Path | None) -> str:
-    """What is assumed of depth where a file that the user passed for a camera.json is none."""
-    return "" if path is None else _description(path, lambda: (2, 2)).assumed
+def assumption(path: str | Path) -> str:
+    """Return what is assumed of depth as a calibration file doesn't state it; empty if nothing."""
+    path = Path(path)
+    if _is_own(path):
+        return ""
+    lens = lens_files.parse_lens_file(reading.read_text(path, limit=_MAX_BYTES), path)
+    stated = {
+        "whole numbers of depth are mm (depth_unit_m)": lens.depth_unit_m,
+        "depth is z (depth_kind)": lens.depth_kind,
+    }
+    assumed = " and ".join(text for text, value in stated.items() if value is None)
+    return f"it is assumed that {assumed}; if not, add that key to {path}" if assumed else ""
 
 
 def load_camera(
@@ -260,7 +253,10 @@ def load_camera(
         As `read_camera_file`; also if the sizes differ, or the model is "rays" without a table.
     """
     path = Path(path)
-    description = _description(path, size_of_images if size is None else lambda: size)
+    if _is_own(path):
+        description = read_camera_file(path)
+    else:
+        description = read_lens_file(path, size_of_images if size is None else lambda: size)
     if size is not None and description.size != size:
         raise InputError(
             f"is of {' x '.join(map(str, description.size or ()))} pixels, depth of "

@@ -168,7 +168,7 @@ def open_recording(
     if len(sources) > 1:
         source = JoinedSource(sources, _short_names([item.path for item in located]))
     _check_usable(source, paths[0])
-    if assumption := camera_file.assumption(options.camera):
+    if options.camera is not None and (assumption := camera_file.assumption(options.camera)):
         source.warnings.append(assumption)
     if len(inner) == 1:
         _read_noise(source, inner[0])
