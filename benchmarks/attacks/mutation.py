@@ -226,7 +226,6 @@ def _possible(
 def _small() -> dict[str, Subject]:
     """Single files: graphs, poses, cameras, configurations, meshes, tracked frames."""
     from tofuse.apps.batch.jobs import read_jobs
-    from tofuse.apps.calibration.lens_files import read_lens_file
     from tofuse.apps.cli.batching import run_arguments
     from tofuse.apps.jobs import tracked_file
     from tofuse.apps.jobs.run_options import read_changes
@@ -238,7 +237,7 @@ def _small() -> dict[str, Subject]:
     from tofuse.engine.results.types import FrameRecord
     from tofuse.engine.tracking.base import Step, Tracker
     from tofuse.formats.cameras.calibration_files import read_noise
-    from tofuse.formats.cameras.camera_file import read_camera_file
+    from tofuse.formats.cameras.camera_file import read_camera_file, read_lens_file
     from tofuse.formats.files.tables import read_columns
     from tofuse.formats.poses.g2o import read_g2o
     from tofuse.formats.poses.pose import read_loops, read_pose

@@ -16,7 +16,7 @@ from tofuse.apps.calibration.board import Board, board_pose, find_corners
 from tofuse.apps.calibration.lens import BoardView, LensFit, calibrate_lens
 from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import Camera, Fisheye, Pinhole, Rational
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, on_command_line
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
@@ -117,9 +117,10 @@ def _bare(frame: RangeFrame) -> RangeFrame:
     ],
 )
 def test_unsuitable_recordings_are_rejected(chosen, board: Board, message: str) -> None:
-    with pytest.raises(InputError) as caught:
+    with on_command_line(), pytest.raises(InputError) as caught:
         calibrate_lens(recording_of(chosen()), board)
-    assert message in str(caught.value)
+    with on_command_line():
+        assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

@@ -93,6 +93,17 @@ def test_floor_is_levelled_and_gravity_takes_precedence() -> None:
     np.testing.assert_allclose(upright(room(), poses, tilted)[1], tilted)
 
 
+@pytest.mark.parametrize("roll", [0.0, 90.0, -90.0])
+def test_up_of_a_walk_is_that_about_which_the_camera_turns(roll) -> None:
+    """Of a phone in portrait orientation, whose images are stored on their side."""
+    model = room(floor=300, ceiling=300, walls=500)
+    poses = cameras(np.linspace(-75, 75, 40), 8.0, roll)
+    assert likely_up(model, poses) @ UP > np.cos(np.radians(4))
+    # Nodding at a wall is no reason to take a level camera for one on its side.
+    nodding = np.concatenate([cameras(np.zeros(1), down, 0.0) for down in np.linspace(-40, 40, 30)])
+    assert likely_up(model, nodding) @ UP > np.cos(np.radians(5))
+
+
 @pytest.mark.parametrize("mesh", [None, room(floor=0, walls=0)])
 def test_up_follows_cameras_without_surface(mesh) -> None:
     poses = cameras(np.linspace(0, 300, 40), 30.0, 0.0)

@@ -110,6 +110,21 @@ def test_wrong_unit_is_detected(z) -> None:
         assert f"{z:.2g}"[:1] in warning
 
 
+def test_clouds_in_different_units_are_detected() -> None:
+    def clouds(*factors: float) -> Recording:
+        points = image(2.0).points
+        return of([CloudFrame.of(f * points, index=k) for k, f in enumerate(factors)])
+
+    finding = next(
+        f for f in inspect_recording(clouds(1, 1000, 1)).findings if f.code == "depth_unit"
+    )
+    assert "median distance of frame 1 is" in finding.text
+    assert finding.remedy.endswith("these frames by 0.001.")
+    # Of two, either may be meant; near and far scans of one place differ less.
+    assert any("of frame 1 is" in f.text for f in inspect_recording(clouds(1, 100)).findings)
+    assert "depth_unit" not in {f.code for f in inspect_recording(clouds(1, 5, 1)).findings}
+
+
 def test_few_and_no_valid_points_are_detected() -> None:
     (few,) = inspect_recording(of([image(2.0, valid=60)])).warnings
     assert few.startswith("Only 5 % of the pixels are valid.")

@@ -14,6 +14,7 @@ import tofuse
 from cli_calls import call
 from registration_scenes import error, stone, turn
 from tofuse.apps.pairs import pair_json, register_files
+from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh
 from tofuse.engine.geometry import se3
 from tofuse.formats.export import exchange
@@ -143,6 +144,45 @@ def test_command_writes_the_scale(tmp_path, capfd) -> None:
     np.testing.assert_allclose(moved, source, atol=0.02)
     aligned = read_ply(tmp_path / "out" / "aligned.ply").points
     np.testing.assert_allclose(aligned, moved, atol=1e-5)
+
+
+def test_known_factor_of_the_unit_is_exact(tmp_path, capfd) -> None:
+    target = stone(3000, 0)
+    source = se3.transform(se3.inverse(T_TRUE), stone(3000, 1))
+    for name, points in (("source", 1000 * source), ("target", target)):
+        write_ply(tmp_path / f"{name}.ply", GeometryRecord(points.astype(np.float32)))
+    words = ("register", tmp_path / "source.ply", tmp_path / "target.ply")
+    # The message names the option that makes the pair fit.
+    assert call(*words) == 3
+    says = r"check its unit; the source at that scale \(--factor (\S+);"
+    factor = re.search(says, capfd.readouterr().out)[1]
+    assert call(*words, "--factor", factor, "--out", tmp_path / "pair") == 0
+    assert "0.001, factor of the source's points" in capfd.readouterr().out
+    moved = se3.transform(np.loadtxt(tmp_path / "pair" / "transform.txt"), 1000 * source)
+    np.testing.assert_allclose(moved, se3.transform(T_TRUE, source), atol=0.005)
+    found = tofuse.register(1000 * source, target, scale=0.001)
+    assert found.believed
+    near(found)
+    assert (found.scale, found.scale_sigma) == (0.001, 0.0)
+    # It is known, so a guess may be as well.
+    near(tofuse.register(1000 * source, target, scale=0.001, guess=T_TRUE))
+    assert call(*words, "--factor", "0.001", "--scale") == 2
+    assert "exclusive" in capfd.readouterr().err
+    with pytest.raises(InputError, match="scale"):
+        tofuse.register(source, target, scale=-1.0)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".glb"])
+def test_mesh_formats_may_hold_a_cloud(suffix, tmp_path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    target = stone(3000, 0)
+    path = tmp_path / f"cloud{suffix}"
+    if suffix == ".obj":
+        path.write_text("".join(f"v {x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in target))
+    else:
+        trimesh.Scene(trimesh.PointCloud(target)).export(path)
+    source = se3.transform(se3.inverse(T_TRUE), stone(3000, 1))
+    near(tofuse.register(source, path, guess=np.eye(4)))
 
 
 def test_large_clouds_may_be_in_mm(tmp_path, capfd) -> None:

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import json
 import pickle
 import re
+import shutil
 import threading
 import time
 from dataclasses import replace
@@ -11,8 +13,8 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from made_phones import make_scanner_app
-from tofuse.engine.cameras.cameras import Pinhole
+from made_phones import exr_bytes, make_scanner_app
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
 from tofuse.engine.errors import InputError, UnreadableFrameError, on_command_line
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
@@ -21,6 +23,7 @@ from tofuse.engine.noise import NOISE, noise_model_for
 from tofuse.formats.cameras import write_noise
 from tofuse.formats.export.conversion import convert
 from tofuse.formats.geometry.ply import write_ply
+from tofuse.formats.images import write_png
 from tofuse.formats.recordings.joined import JoinedSource
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording, readers
@@ -144,6 +147,117 @@ def test_images_without_a_camera(tmp_path: Path) -> None:
         open_recording(folder)
     camera = tmp_path / "camera.json"
     assert depths(open_recording(folder, format="native", camera=camera)) == [1]
+
+
+def test_folder_of_images_needs_only_a_camera(tmp_path: Path) -> None:
+    """Bare images of a camera of which there is a calibration file of another program."""
+    folder = write(tmp_path / "a", [1, 3])
+    unit = json.loads((folder / "camera.json").read_text())["depth_unit_m"]
+    (folder / "camera.json").unlink()
+    lens = tmp_path / "K.txt"
+    lens.write_text("35 0 19.5\n0 35 14.5\n0 0 1\n")
+    recording = open_recording(folder, camera=lens)
+    assert recording.format == "native"
+    assert recording[0].camera == BrownConrady(40, 30, 35.0, 35.0, 19.5, 14.5)
+    assert any("are mm (depth_unit_m) and depth is z" in text for text in recording.warnings)
+    # The file may say so, in whatever it is written.
+    lens.write_text(lens.read_text() + f"depth_unit_m: {unit}\ndepth_kind: z\n")
+    recording = open_recording(folder, camera=lens)
+    assert depths(recording) == [1, 3]
+    assert not recording.warnings
+    # The images alone, wherever they lie, with times beside them.
+    bare = (folder / "depth").rename(tmp_path / "scan")
+    (bare / "timestamps.txt").write_text("5.0\n5.5\n")
+    recording = open_recording(bare, camera=lens)
+    assert recording.format == "depth-png"
+    assert depths(recording) == [1, 3]
+    assert recording.timestamps.tolist() == [5.0, 5.5]
+    says = r"has 2 PNGs, of depth among them; .* use camera=camera\.json"
+    with pytest.raises(InputError, match=says):
+        open_recording(bare)
+    # Colour in between is left out, and a folder with them may be passed.
+    for k in range(2):
+        write_png(bare / f"{k:06d}-c.png", np.full((60, 80, 3), 9, np.uint8))
+    (bare / "000001.png").write_bytes(b"cut off")
+    (tmp_path / "all" / "rgb").mkdir(parents=True)
+    bare = bare.rename(tmp_path / "all" / "scan")
+    recording = open_recording(tmp_path / "all", camera=lens)
+    assert recording.format == "depth-png"
+    assert len(recording) == 2
+    assert depths(recording[:1]) == [1]
+    assert any("2 images without 16-bit depth left out" in text for text in recording.warnings)
+    with pytest.raises(InputError, match=r"if the depth images are in scan/, use camera="):
+        open_recording(tmp_path / "all")
+    # A format with names of its own comes first.
+    (bare / "000000.png").rename(bare / "depth0.png")
+    assert open_recording(bare, camera=lens).format == "pairs"
+
+
+def test_colour_of_another_size_is_for_display_if_no_camera_is_known(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", [1, 2])
+    (folder / "camera.json").unlink()
+    (folder / "color").mkdir()
+    for k in range(2):
+        write_png(folder / "color" / f"{k:06d}.png", np.full((60, 80, 3), 9, np.uint8))
+    lens = tmp_path / "K.txt"
+    lens.write_text("35 35 19.5 14.5\n")
+    recording = open_recording(folder, camera=lens)
+    assert any("another size than depth" in text for text in recording.warnings)
+    frame = recording[0]
+    assert frame.color_image is not None
+    assert not frame.color_registered
+
+
+def test_depth_in_openexr_is_in_metres(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", [1])
+    (folder / "depth" / "000000.png").unlink()
+    depth = np.full((30, 40), 1.25, np.float32)
+    depth[0, :2] = np.nan, np.inf
+    (folder / "depth" / "000000.exr").write_bytes(exr_bytes(depth))
+    frame = open_recording(folder)[0]
+    assert (frame.depth[1:] == 1.25).all()
+    assert not frame.depth[0, :2].any()
+
+
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        (["scan.glb"], r"is a model, not a recording; .*`tofuse register` and"),
+        (["a.obj", "a.mtl", "a.jpg"], "is a model, not a recording"),
+        (["IMG_1.MOV"], "is a video, without depth"),
+        (["1.jpg", "2.HEIC"], "is of photos, without depth"),
+    ],
+)
+def test_exports_without_depth_are_named(tmp_path: Path, names: list[str], says: str) -> None:
+    """What people get who choose the wrong entry in the menu of their app."""
+    for name in names:
+        (tmp_path / name).write_bytes(b"abc")
+    for path in [tmp_path, tmp_path / names[0]]:
+        if len(names) == 1 or path == tmp_path:
+            with pytest.raises(InputError, match=says):
+                open_recording(path)
+    # Colour of a recording leads to its folder.
+    folder = write(tmp_path / "r", [1])
+    (folder / "0.jpg").write_bytes(b"abc")
+    with pytest.raises(InputError, match="pass the recording's folder"):
+        open_recording(folder / "0.jpg")
+    shutil.rmtree(folder)
+    (tmp_path / "unknown").mkdir()
+    with pytest.raises(InputError, match=r"known format: it contains .* folder"):
+        open_recording(tmp_path)
+
+
+def test_file_passed_for_a_format_may_have_any_suffix(tmp_path: Path) -> None:
+    table = tmp_path / "points.csv"
+    table.write_text("x,y,z\n" + "1,2,3\n" * 12)
+    with pytest.raises(InputError, match="or use format xyz for a single one"):
+        open_recording(table)
+    assert len(open_recording(table, format="xyz")[0]) == 12
+    write_ply(tmp_path / "a.ply", GeometryRecord(np.ones((3, 3))))
+    (tmp_path / "a.ply").rename(tmp_path / "a.dat")
+    assert len(open_recording(tmp_path / "a.dat", format="ply")[0]) == 3
+    with pytest.raises(InputError, match="is not a PLY file"):
+        open_recording(table, format="ply")
 
 
 def test_limits_of_depth(tmp_path: Path) -> None:
@@ -350,7 +464,8 @@ def test_messages_name_arguments_in_python_and_options_on_the_command_line(tmp_p
         with on_command_line(), pytest.raises(InputError) as typed:
             open_recording(folder, **arguments)
         assert typed.value.where == option
-    (folder / "depth" / "000000.png").rename(folder / "0.png")
+    (folder / "depth" / "000000.png").rename(folder / "0.bin")
+    (folder / "depth").rmdir()
     (folder / "camera.json").unlink()
     with pytest.raises(InputError, match=f"{re.escape(str(folder))}: .* or use format "):
         open_recording(folder)

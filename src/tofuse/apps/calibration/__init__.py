@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from tofuse.apps.calibration.camera_json import check_new, recording_fields, write_camera_json
     from tofuse.apps.calibration.depth import calibrate_depth, compose
     from tofuse.apps.calibration.lens import calibrate_lens
-    from tofuse.apps.calibration.lens_files import read_lens_file
     from tofuse.apps.calibration.noise_estimation import estimate_noise
     from tofuse.apps.calibration.plane_views import board_planes, scene_planes
 

@@ -15,7 +15,6 @@ from tofuse.apps.calibration import (
     check_new,
     compose,
     estimate_noise,
-    read_lens_file,
     recording_fields,
     scene_planes,
     write_camera_json,
@@ -158,26 +157,29 @@ def _import_lens(arguments: Calibrate) -> Summary:
     recording = None if arguments.recording is None else open_recording(arguments.recording)
     frame = None if recording is None else recording.first_readable()
     size = (frame.camera.width, frame.camera.height) if isinstance(frame, RangeFrame) else None
-    lens_file = read_lens_file(arguments.inputs[0], size)
-    own = lens_file.camera.width, lens_file.camera.height
+    size_of_images = None if size is None else lambda: size
+    lens_file = camera_file.read_lens_file(arguments.inputs[0], size_of_images)
+    camera = lens_file.camera
+    assert camera is not None
+    own = camera.width, camera.height
     if size not in (None, own):
         warnings.append(
             f"the lens is that of images of {own[0]} x {own[1]} pixels, and those of "
             f"{arguments.recording} have {size[0]} x {size[1]}: calibrate images of that size"
         )
-    if recording is None:
-        warnings.append(
-            "depth is assumed to be z in mm; pass --recording to take it from a recording"
-        )
-    else:
+    if recording is not None:
         metadata = recording_fields(recording)
-    fields = camera_file.camera_fields(lens_file.camera)
+    else:
+        metadata = {"depth_unit_m": lens_file.depth_unit_m, "depth_kind": lens_file.depth_kind}
+        if assumption := camera_file.assumption(arguments.inputs[0]):
+            warnings.append(f"{assumption}, or pass --recording to take it from a recording")
+    fields = camera_file.camera_fields(camera)
     lines = [f"{name} {value}" for name, value in fields.items()]
-    lines.append(f"read as a file of {lens_file.format}")
+    lines.append(f"read as a file of {lens_file.program}")
     if arguments.out is not None:
-        write_camera_json(arguments.out, lens_file.camera, metadata)
+        write_camera_json(arguments.out, camera, metadata)
         lines.append(f"written to {arguments.out}")
-    return {"format": lens_file.format, "warnings": warnings} | fields, lines, warnings
+    return {"format": lens_file.program, "warnings": warnings} | fields, lines, warnings
 
 
 def _board(arguments: Calibrate) -> Board:

@@ -122,7 +122,7 @@ class Source(Command):
     format : F
         input format, if not recognised
     camera : FILE
-        use this camera.json instead of the recording's own
+        camera.json to use instead of the recording's own, or lens by OpenCV, ROS, ...
     topic : T
         topic of a ROS bag, if the default is wrong
     """
@@ -342,6 +342,8 @@ class Register(Written, Json, Threads, Source):
         registration method, such as icp (any-pair)
     scale
         the source is of unknown scale, as models from images alone are
+    factor : F
+        multiply the source's coordinates by F, such as 0.001 for a file in mm
     risk : P
         probability with which an accepted pose may be wrong, up to 0.1 (0.1)
 
@@ -357,6 +359,7 @@ class Register(Written, Json, Threads, Source):
     guess: Path | None = None
     method: str | None = None
     scale: bool = False
+    factor: float | None = None
     risk: float = 0.1
 
 

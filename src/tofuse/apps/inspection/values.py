@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.apps.inspection.finding import Finding
 from tofuse.apps.inspection.sample import Sample
 from tofuse.engine.arrays import Bool, Float32
-from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame
+from tofuse.engine.frames import SATURATED_AMPLITUDE, Frame, RangeFrame, frame_ranges
 from tofuse.engine.quantities import percent
 from tofuse.engine.sensor import Unwrap, on_surface
 
@@ -38,6 +38,8 @@ _MAX_WRAPPED, _MINORITY_VIEWS = 0.5, 0.9
 # mean differences of neighbours with swapped bytes to those as read, below which they are swapped.
 _MAX_FRACTION, _MIN_SWAPPED_RATIO = 0.05, 0.2
 _ROUGH = 0.01  # mean relative difference of neighbours below which depth is as smooth as any
+# Ratio of typical distances of clouds above which they are in different units: half of that of cm.
+_MIN_UNIT_RATIO = 50.0
 # Minimum number of edge pixels per image to assess flying pixels.
 _MIN_EDGES = 100
 
@@ -76,6 +78,11 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
             {"roughness_if_swapped": ratio},
         )
         return
+    if (
+        mixed := _mixed_units([f for f in sample.frames if not isinstance(f, RangeFrame)])
+    ) is not None:
+        yield mixed
+        return
     median = float(np.median(depths))
     period = sample.period_m
     evidence = {"median_m": median, "far_m": float(np.percentile(depths, 99))}
@@ -99,6 +106,28 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
         f"The median depth is {median:.3g} m, {problem}.",
         remedy,
         evidence | {"factor": factor},
+    )
+
+
+def _mixed_units(clouds: Sequence[Frame]) -> Finding | None:
+    """The finding that some clouds are in another unit than most; None if their distances agree."""
+    typical = {f.index: float(np.median(depths_of(f))) for f in clouds if len(f)}
+    distances = sorted(distance for distance in typical.values() if distance > 0)
+    if not distances:
+        return None
+    usual = distances[(len(distances) - 1) // 2]
+    off = [k for k, d in typical.items() if d and abs(np.log(d / usual)) > np.log(_MIN_UNIT_RATIO)]
+    if not off:
+        return None
+    ratio = typical[off[0]] / usual
+    where = frame_ranges.in_words(frame_ranges.runs_of(sorted(typical), off))
+    return Finding(
+        "depth_unit",
+        f"The median distance of {where} is {typical[off[0]]:.3g} m, that of the others about "
+        f"{usual:.3g} m: their units differ.",
+        "Coordinates are read as metres: multiply those in the files of these frames by "
+        f"{10.0 ** -np.round(np.log10(ratio)):g}.",
+        {"ratio": ratio, "frames": float(len(off))},
     )
 
 

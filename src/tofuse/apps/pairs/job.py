@@ -11,10 +11,12 @@ from threadpoolctl import threadpool_limits
 from tofuse.apps.pairs.registering import (
     MAX_RISK,
     RISKS,
+    at_factor,
     at_risk,
     registered_near,
     registered_scaled,
     registrar_of,
+    with_factor,
 )
 from tofuse.apps.pairs.result import CONTRACT, MARKER, PairResult, pair_json, write_aligned
 from tofuse.apps.pairs.views import named_view
@@ -42,6 +44,8 @@ class PairOptions(folders.OutputOptions):
         Name of a registration method; None for `AnyPair`.
     scale
         Whether the source is of unknown scale.
+    factor
+        Of the source's coordinates, if its unit is another than the target's.
     risk
         Largest probability, up to `MAX_RISK`, with which an accepted pose may be wrong.
     format, camera, topic
@@ -53,6 +57,7 @@ class PairOptions(folders.OutputOptions):
     guess: Path | None = None
     method: str | None = None
     scale: bool = False
+    factor: float | None = None
     risk: float = MAX_RISK
     format: str | None = None
     camera: Path | None = None
@@ -95,14 +100,17 @@ def pair_exit_status(result: PairResult) -> int:
 def _registered(
     source: str, target: str, guess: Float64 | None, options: PairOptions, progress: Progress
 ) -> PairResult:
+    if options.scale and options.factor is not None:
+        raise InputError("are exclusive", where="--scale, --factor", remedy="leave one out")
     views = _open_both(source, target, options)
-    near = NearOrigin.of(views[0].frame, views[1].frame, guess)
+    near = NearOrigin.of(at_factor(views[0].frame, options.factor), views[1].frame, guess)
     progress.stage("registering")
     start_s = perf_counter()
     if options.scale:
         near, registration = registered_scaled(near, options.method)
     else:
         registration = registered_near(near, registrar_of(options.method))
+    registration = with_factor(registration, options.factor)
     seconds = perf_counter() - start_s
     name = None if options.guess is None else str(options.guess)
     near_source = replace(views[0], frame=near.source)

@@ -74,12 +74,13 @@ def lines(result: PairResult) -> list[tuple[str, str]]:
 
 
 def scale(registration: Registration) -> list[tuple[str, str]]:
-    """Return name and value of the scale; nothing if it was not estimated."""
+    """Return name and value of the scale; nothing if it was neither estimated nor given."""
     sigma = registration.scale_sigma
     if sigma is None:
         return []
     factor = f"{registration.scale:.5g} \N{PLUS-MINUS SIGN} {sigma:.1g}"
-    return [("scale", f"{factor} (1\N{GREEK SMALL LETTER SIGMA}), factor of the source's points")]
+    known = f"{factor} (1\N{GREEK SMALL LETTER SIGMA})" if sigma else f"{registration.scale:.9g}"
+    return [("scale", f"{known}, factor of the source's points")]
 
 
 def rotation(result: PairResult) -> str:

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 from tofuse.apps.pairs.views import View, view_of
 from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.clouds import AnyPair, NearOrigin, register_similar
+from tofuse.engine.clouds import AnyPair, NearOrigin, register_similar, scaled
 from tofuse.engine.compute import one_blas_thread
 from tofuse.engine.errors import InputError, signals_as_themselves
-from tofuse.engine.frames import RangeFrame
+from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number, discover, name_of, registered
 from tofuse.engine.quantities import percent
@@ -25,6 +25,7 @@ _METHODS = ("tofuse.engine.icp", "tofuse.engine.clouds", "tofuse.lab.methods")
 # Risks that poses are accepted at: the engine rejects those beyond the largest.
 MAX_RISK = round(1 - pose_probability.ACCEPTED, 6)
 RISKS = Bounds(0, MAX_RISK)
+FACTORS = Bounds(1e-6, 1e6)
 
 
 @signals_as_themselves()
@@ -34,7 +35,7 @@ def register(
     *,
     guess: ArrayLike | None = None,
     method: Registrar | str | None = None,
-    scale: bool = False,
+    scale: bool | float = False,
     risk: float = MAX_RISK,
     seed: int = 0,
 ) -> Registration:
@@ -64,7 +65,8 @@ def register(
     scale
         Whether the source is of unknown scale, as models from images alone are. Then `scale` is the
         factor of its points before `T_target_source` is applied, between a fourth and four times
-        that of equal extents, and `scale_sigma` its standard deviation; seconds.
+        that of equal extents, and `scale_sigma` its standard deviation; seconds. Or that factor, if
+        it is known, such as 0.001 for a source in mm.
     risk
         Largest probability, up to 0.1, with which a pose that is `believed` may be wrong. As most
         are nearly certain, a hundredth of those with less than 0.1 is expected to be wrong.
@@ -95,12 +97,27 @@ def register(
     check_number(seed, Bounds(0), "seed", whole=True)
     check_number(risk, RISKS, "risk")
     start = None if guess is None else se3.check_pose(guess, where="guess")
-    near = NearOrigin.of(view_of(source, "source"), view_of(target, "target"), start)
-    if scale:
+    factor = None if isinstance(scale, bool) else scale
+    moving = at_factor(view_of(source, "source"), factor, "scale")
+    near = NearOrigin.of(moving, view_of(target, "target"), start)
+    if scale is True:
         near, registration = registered_scaled(near, method, seed)
     else:
         registration = registered_near(near, registrar_of(method), seed)
-    return near.in_files(at_risk(registration, risk))
+    return near.in_files(at_risk(with_factor(registration, factor), risk))
+
+
+def at_factor(view: Frame, factor: float | None, where: str = "--factor") -> Frame:
+    """Return a view in the unit of the other one: its points times a factor; itself for None."""
+    if factor is None:
+        return view
+    check_number(factor, FACTORS, where)
+    return scaled(view, factor)
+
+
+def with_factor(registration: Registration, factor: float | None) -> Registration:
+    """Return the registration of a view `at_factor`, with that as its exact scale."""
+    return registration if factor is None else replace(registration, scale=factor, scale_sigma=0.0)
 
 
 def at_risk(registration: Registration, risk: float) -> Registration:

@@ -12,6 +12,7 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.engine.clouds import fpfh, robust_motion
+    from tofuse.engine.clouds.cloud_pair import scaled
     from tofuse.engine.clouds.near_origin import NearOrigin
     from tofuse.engine.clouds.pair import MIN_POINTS, AnyPair
     from tofuse.engine.clouds.similarity import register_similar

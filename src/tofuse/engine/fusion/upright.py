@@ -15,9 +15,12 @@ _MAX_TILT, _MAX_NORMAL_ANGLE = np.radians(25.0), np.radians(12.0)
 _MIN_FRACTION, _MAX_BELOW = 0.04, 0.02
 # Candidates for up, about 3 degrees apart; normals and cameras that they are scored by.
 _DIRECTIONS, _MAX_NORMALS, _MAX_CAMERAS = 4000, 1000, 100
-# Standard deviations of the roll of a handheld camera, and of its pitch upwards and downwards: most
-# objects are below eye level. Minimum log-likelihood of one camera.
+# Standard deviations of the roll of a handheld camera, and of its mean pitch upwards and downwards:
+# most objects are below eye level. That of the pitch about this mean: people look around more than
+# up and down, which is what looking around is for a camera on its side that is taken for level.
+# Minimum log-likelihood of one camera.
 _ROLL_SIGMA, _PITCH_UP_SIGMA, _PITCH_DOWN_SIGMA = np.radians([15.0, 40.0, 60.0])
+_PITCH_VARIATION = np.radians(20.0)
 _MIN_LOG_LIKELIHOOD = -5.0
 _CORRELATION_ANGLE = np.radians(30.0)  # correlation angle between orientations of cameras
 # Log priors: one camera in twenty is permanently on its side or upside down.
@@ -68,9 +71,9 @@ def likely_up(mesh: Mesh | None, poses: Float64) -> Float64:
     """Return the unit vector (3,) in the world that is most probably up.
 
     Handheld cameras have a level horizon (by which panoramas are straightened: Brown and Lowe 2007,
-    section 5) and varying pitch; some are permanently on their side or upside down. Man-made
-    surfaces are horizontal or vertical, and horizontal ones are mostly seen from above, as floors
-    and tables.
+    section 5), any pitch, and turn more than they nod; some are permanently on their side or upside
+    down. Man-made surfaces are horizontal or vertical, and horizontal ones are mostly seen from
+    above, as floors and tables.
 
     Parameters
     ----------
@@ -111,9 +114,11 @@ def _camera_score(R_world_camera: Float64, ups: Float64) -> Float64:
     ):
         roll = np.arcsin(sideways.clip(-1, 1))
         pitch_down = np.arctan2(-forward, upwards)
+        mean = pitch_down.mean(1, keepdims=True)
         log_likelihood = -0.5 * (
             (roll / _ROLL_SIGMA) ** 2
-            + (pitch_down / np.where(pitch_down < 0, _PITCH_UP_SIGMA, _PITCH_DOWN_SIGMA)) ** 2
+            + (mean / np.where(mean < 0, _PITCH_UP_SIGMA, _PITCH_DOWN_SIGMA)) ** 2
+            + ((pitch_down - mean) / _PITCH_VARIATION) ** 2
         )
         scores.append(
             effective_cameras * np.maximum(log_likelihood, _MIN_LOG_LIKELIHOOD).mean(1) + prior

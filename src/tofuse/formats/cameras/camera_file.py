@@ -1,8 +1,10 @@
-"""camera.json: the description of the camera of a native recording."""
+"""camera.json, the description of the camera of a native recording, and files in its place."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -12,11 +14,21 @@ from numpy.typing import NDArray
 
 from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
-from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Camera, Pinhole, RayTable
+from tofuse.engine.cameras import (
+    DISTORTION_ORDER,
+    MODELS,
+    Camera,
+    Pinhole,
+    RayTable,
+    pinhole_values,
+)
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import AmplitudeKind, DepthKind
 from tofuse.engine.geometry import se3
+from tofuse.formats.cameras import lens_files
 from tofuse.formats.files import npz, reading
+
+SizeOf = Callable[[], tuple[int, int]]
 
 # Limits for any camera: a frame per month to a million per second; ambiguity ranges of modulation
 # at 15 GHz to 1.5 kHz.
@@ -28,7 +40,10 @@ MAX_SLOPE = 1e4  # of a ray: 89.99 degrees off the axis
 AMPLITUDE_KINDS = ("raw", "range_compensated", "ir")
 
 _FOREIGN = "correct it, or convert a file of another program by `tofuse calibrate import`"
+_MAX_BYTES = 64 << 20
 _METRES = "the metres of one count, such as 0.001"
+# Of a JSON object that is meant for a camera.json.
+_OWN = {"schema", "model"}
 _LENS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
 
 
@@ -66,6 +81,8 @@ class CameraFile:
         The colour camera, unless colour has the pixels of depth.
     unknown
         Unknown keys.
+    program
+        Of a file of another program its `LensFile.format`; None for a camera.json.
     """
 
     camera: Pinhole | None
@@ -83,6 +100,7 @@ class CameraFile:
     color_registered: bool = True
     color: ColorCamera | None = None
     unknown: tuple[str, ...] = ()
+    program: str | None = None
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -95,7 +113,7 @@ class CameraFile:
         return {name: value for name, value in values.items() if value is not None}
 
 
-_KEYS = {field.name for field in fields(CameraFile)} - {"camera", "size", "unknown"}
+_KEYS = {field.name for field in fields(CameraFile)} - {*("camera", "size", "unknown", "program")}
 
 
 def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
@@ -113,7 +131,7 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
     InputError
         Naming file and field, with a remedy.
     """
-    data = reading.parse_json(reading.read_text(path, limit=64 << 20), path, _FOREIGN)
+    data = reading.parse_json(reading.read_text(path, limit=_MAX_BYTES), path, _FOREIGN)
     get = _Fields(data, str(path))
     if "schema" not in data:
         raise InputError("has no schema, and is no camera.json", where=path, remedy=_FOREIGN)
@@ -125,9 +143,7 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
     kind: DepthKind = "z"
     if not (clouds and "model" not in data):
         camera, size = _lens(get)
-        unit = get.positive("depth_unit_m", required=True, hint=_METRES) or 0.001
-        if not 1e-9 <= unit <= 1:
-            raise get.error("depth_unit_m", f"is {unit}", "set the metres per count, at most 1")
+        unit = get.depth_unit(required=True) or 0.001
         kind = get.choice("depth_kind", ("z", "range"), required=True)  # type: ignore[assignment]
         color = _color(get)
     return CameraFile(
@@ -149,8 +165,78 @@ def read_camera_file(path: str | Path, *, clouds: bool = False) -> CameraFile:
     )
 
 
-def load_camera(path: str | Path, size: tuple[int, int] | None = None) -> tuple[CameraFile, Camera]:
+def read_lens_file(path: str | Path, size_of_images: SizeOf | None = None) -> CameraFile:
+    """Read the camera of depth from a calibration file of another program.
+
+    What it does not state of depth is z in mm, see `assumption`; the rest is `parse_lens_file`.
+
+    Parameters
+    ----------
+    path
+        The file.
+    size_of_images
+        Returns width and height of the images, if the file does not state them.
+
+    Raises
+    ------
+    InputError
+        If it is no such file, or its values are invalid.
+    """
+    lens = lens_files.parse_lens_file(reading.read_text(path, limit=_MAX_BYTES), path)
+    stated = lens.size or (None if size_of_images is None else size_of_images())
+    if stated is None:
+        raise InputError(
+            "doesn't state the image size",
+            where=path,
+            remedy="add image_width and image_height to it, or pass --recording to "
+            "`tofuse calibrate import`",
+        )
+    width, height = image_size(stated[0], stated[1], f"{path}: image size")
+    values = pinhole_values(lens.K, (height, width), f"{path}: camera_matrix")
+    order = DISTORTION_ORDER[lens.model]
+    values |= dict(zip(order, lens.distortion, strict=False))
+    camera = checked_lens(MODELS[lens.model], (width, height), values, path)
+    get = _Fields({"depth_unit_m": lens.depth_unit_m, "depth_kind": lens.depth_kind}, str(path))
+    unit, kind = get.depth_unit(), get.choice("depth_kind", ("z", "range"))
+    return CameraFile(
+        camera,
+        (width, height),
+        unit or 0.001,
+        kind or "z",  # type: ignore[arg-type]
+        program=lens.format,
+    )
+
+
+def _is_own(path: Path) -> bool:
+    """Whether a file is meant for a camera.json, not of another program."""
+    data: Any = None
+    with suppress(InputError):
+        data = reading.parse_json(reading.read_text(path, limit=_MAX_BYTES), path)
+    return path.suffix.lower() == ".json" if data is None else bool(_OWN & data.keys())
+
+
+def assumption(path: str | Path) -> str:
+    """Return what is assumed of depth as a calibration file doesn't state it; empty if nothing."""
+    path = Path(path)
+    if _is_own(path):
+        return ""
+    lens = lens_files.parse_lens_file(reading.read_text(path, limit=_MAX_BYTES), path)
+    stated = {
+        "whole numbers of depth are mm (depth_unit_m)": lens.depth_unit_m,
+        "depth is z (depth_kind)": lens.depth_kind,
+    }
+    assumed = " and ".join(text for text, value in stated.items() if value is None)
+    return f"it is assumed that {assumed}; if not, add that key to {path}" if assumed else ""
+
+
+def load_camera(
+    path: str | Path,
+    size: tuple[int, int] | None = None,
+    size_of_images: SizeOf | None = None,
+) -> tuple[CameraFile, Camera]:
     """Read a camera.json and the rays.npy in its folder, which overrides the lens model.
+
+    Also a calibration file of another program, see `read_lens_file`.
 
     Parameters
     ----------
@@ -158,6 +244,8 @@ def load_camera(path: str | Path, size: tuple[int, int] | None = None) -> tuple[
         The file.
     size
         Expected width and height, if known.
+    size_of_images
+        Returns width and height of the images if `size` isn't known, for files without a size.
 
     Raises
     ------
@@ -165,7 +253,10 @@ def load_camera(path: str | Path, size: tuple[int, int] | None = None) -> tuple[
         As `read_camera_file`; also if the sizes differ, or the model is "rays" without a table.
     """
     path = Path(path)
-    description = read_camera_file(path)
+    if _is_own(path):
+        description = read_camera_file(path)
+    else:
+        description = read_lens_file(path, size_of_images if size is None else lambda: size)
     if size is not None and description.size != size:
         raise InputError(
             f"is of {' x '.join(map(str, description.size or ()))} pixels, depth of "
@@ -174,7 +265,7 @@ def load_camera(path: str | Path, size: tuple[int, int] | None = None) -> tuple[
             remedy="pass the camera of these images",
         )
     table = path.parent / "rays.npy"
-    if not reading.is_file(table):
+    if description.program is not None or not reading.is_file(table):
         if description.camera is None:
             raise InputError(
                 "is 'rays' and there is no rays.npy",
@@ -289,6 +380,13 @@ class _Fields:
         if value is not None and value <= 0:
             raise self.error(field, f"is {value}", f"use {hint}")
         return value
+
+    def depth_unit(self, *, required: bool = False) -> float | None:
+        unit = self.positive("depth_unit_m", required=required, hint=_METRES)
+        if unit is not None and not 1e-9 <= unit <= 1:
+            remedy = "set the metres per count, at most 1"
+            raise self.error("depth_unit_m", f"is {unit}", remedy)
+        return unit
 
     def within(self, field: str, low: float, high: float) -> float | None:
         value = self.positive(field)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import GeometryRecord
-from tofuse.engine.geometry import triangles
+from tofuse.engine.geometry import se3, triangles
 from tofuse.formats.files import reading
 from tofuse.formats.geometry.ply import read_ply
 
@@ -32,7 +33,7 @@ def is_surface(path: Path) -> bool:
 
 
 def read_surface(path: Path) -> GeometryRecord:
-    """Read the triangles of a file, in its coordinates.
+    """Read the triangles of a file, or the points of one without any, in its coordinates.
 
     Raises
     ------
@@ -44,9 +45,20 @@ def read_surface(path: Path) -> GeometryRecord:
     trimesh = reading.required_package("trimesh", None, path)
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
-        return GeometryRecord(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32))
+        if len(mesh.faces):
+            return GeometryRecord(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32))
+        return GeometryRecord(_vertices(trimesh.load(path, force="scene", process=False)))
     except Exception as error:  # trimesh has no exception of its own
         raise InputError(f"is no readable mesh ({error})", where=path) from error
+
+
+def _vertices(scene: Any) -> Float64:
+    """The vertices (N, 3) of all parts of a scene of trimesh, which a cloud has without faces."""
+    parts = [np.zeros((0, 3))]
+    for node in scene.graph.nodes_geometry:
+        T, name = scene.graph[node]
+        parts.append(se3.transform(T, np.asarray(scene.geometry[name].vertices, np.float64)))
+    return np.concatenate(parts)
 
 
 def surface_points(mesh: GeometryRecord, where: str | Path, count: int = _POINTS) -> Float64:

@@ -10,7 +10,7 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.formats.images import matroska
-    from tofuse.formats.images.exr import parse_exr
+    from tofuse.formats.images.exr import read_exr_depth
     from tofuse.formats.images.images import (
         as_color,
         check_first_size,

@@ -21,7 +21,7 @@ import numpy as np
 from tofuse.engine.arrays import Float32, UInt8
 from tofuse.engine.errors import InputError
 from tofuse.formats.files import reading
-from tofuse.formats.images.images import check_pixels
+from tofuse.formats.images.images import MAX_IMAGE_BYTES, check_camera_size, check_pixels
 
 MAGIC = b"\x76\x2f\x31\x01"
 _SINGLE_SCAN_LINES = 2  # the version, with none of the flags for tiles, parts or deep data
@@ -52,6 +52,19 @@ def parse_exr(data: bytes, path: str | Path) -> dict[str, Float32]:
     """
     with reading.about(path, "copy the file again"):
         return _parsed(data)
+
+
+def read_exr_depth(path: str | Path, size: tuple[int, int] | None = None) -> Float32:
+    """Read the depth (H, W) of an image: its only channel, of several R, Z or Y.
+
+    For errors see `parse_exr`; also if it isn't of `size` (width, height).
+    """
+    channels = parse_exr(reading.read_bytes(path, limit=MAX_IMAGE_BYTES), path)
+    name = next((n for n in ("R", "Z", "Y") if n in channels), next(iter(channels)))
+    with reading.about(path):
+        height, width = channels[name].shape
+        check_camera_size(width, height, size)
+    return channels[name]
 
 
 def _parsed(data: bytes) -> dict[str, Float32]:

@@ -34,7 +34,7 @@ class Arducam(Reader):
         if reading.is_file(path / "camera.json"):
             return Sniff(1.0, f"{evidence} and camera.json")
         remedy = "use --format arducam with --camera: lens and unit are not in such files"
-        return Sniff(Sniff.UNCERTAIN, evidence, remedy)
+        return Sniff(Sniff.UNCERTAIN, evidence, remedy, needs_camera=True)
 
     def open(self, path: Path, options: ReaderOptions) -> ArducamSource:
         """See `Reader.open`."""

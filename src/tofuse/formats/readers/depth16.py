@@ -31,7 +31,7 @@ class Depth16(Reader):
         if reading.is_file(path / "camera.json"):
             return Sniff(1.0, f"{evidence} and camera.json")
         remedy = "use --format depth16 with --camera: size and lens are not in such files"
-        return Sniff(Sniff.UNCERTAIN, evidence, remedy)
+        return Sniff(Sniff.UNCERTAIN, evidence, remedy, needs_camera=True)
 
     def open(self, path: Path, options: ReaderOptions) -> Depth16Source:
         """See `Reader.open`."""

@@ -18,7 +18,13 @@ from tofuse.engine.parts import part
 from tofuse.engine.sensor import DepthCorrection
 from tofuse.formats.cameras import camera_file, corrected_depth, read_correction
 from tofuse.formats.files import reading, tables
-from tofuse.formats.images import check_first_size, read_color, read_image
+from tofuse.formats.images import (
+    check_first_size,
+    first_size,
+    read_color,
+    read_exr_depth,
+    read_image,
+)
 from tofuse.formats.sources import (
     FileSource,
     Reader,
@@ -67,7 +73,7 @@ class NativeSource(FileSource):
         remedy = "check that the recording is complete"
         files = reading.files_with(folder / name, *suffixes)
         if not (files or self.is_clouds):
-            files = reading.files_with(folder / name, ".npy")
+            files = reading.files_with(folder / name, ".npy", ".exr")
         self.files = inputs.required(files, f"{suffixes[0]} files", folder / name, remedy)
         self.description, self.camera = self._read_camera(camera_path)
         self.unit, self.kind = self.description.depth_unit_m, self.description.depth_kind
@@ -82,6 +88,7 @@ class NativeSource(FileSource):
         self.rays = self._channel_files("rays", ".npy")
         if camera_path is not None:
             self.rays = []  # the camera passed by the user applies to all frames
+        self.color_registered = self._is_registered()
         self.correction = self._read_correction()
         self.imu = self._read_table("imu.csv")
         self.frame_columns = self._read_table("frames.csv", rows=len(self.files))
@@ -119,9 +126,7 @@ class NativeSource(FileSource):
         if self.sigma:
             counts = self._read(self.sigma, index, "uint16").astype(np.float32)
             images["sigma_image"] = counts * np.float32(self.description.sigma_unit_m or 0)
-        return self.image(
-            index, depth, color_registered=self.description.color_registered, **images
-        )
+        return self.image(index, depth, color_registered=self.color_registered, **images)
 
     def _read_color(self, path: Path, frame: RangeFrame) -> UInt8:
         """The colour (H, W, 3) of a frame, from its image."""
@@ -132,15 +137,26 @@ class NativeSource(FileSource):
 
     @property
     def _color_is_for_display(self) -> bool:
-        return not self.description.color_registered and self.description.color is None
+        return not self.color_registered and self.description.color is None
+
+    def _is_registered(self) -> bool:
+        """Whether colour has the pixels of depth, which only a camera.json states."""
+        description = self.description
+        if description.program is None or not self.color or first_size(self.color) == self._size:
+            return description.color_registered
+        self.warnings.append(
+            "colour is of another size than depth and has no camera: it is for display only; "
+            "describe its camera in a camera.json (docs/formats.md) to use it"
+        )
+        return False
 
     def _depth(self, index: int) -> Float32:
         """Depth (H, W), m."""
         path = self.files[index]
-        if path.suffix.lower() != ".npy":
+        if path.suffix.lower() == ".png":
             counts = self._read(self.files, index, "uint16")
             return depth_counts.depth_from_counts(counts, self.unit)
-        numbers = read_image(path, size=self._size)
+        numbers = self._numbers(path, self._size)
         in_metres = numbers.dtype.kind == "f"
         depth = depth_counts.depth_from_numbers(numbers, 1.0 if in_metres else self.unit)
         if in_metres and (depth > _MAX_MEDIAN_M).sum() > (depth > 0).sum() / 2:
@@ -150,6 +166,18 @@ class NativeSource(FileSource):
                 remedy="save metres, or integers in units of depth_unit_m",
             )
         return depth
+
+    def _size_of_images(self) -> tuple[int, int]:
+        nothing = InputError("has no images", where=self.files[0].parent)
+        height, width = reading.first_readable(self.files, self._numbers, nothing).shape[:2]
+        return width, height
+
+    @staticmethod
+    def _numbers(path: Path, size: tuple[int, int] | None = None) -> NDArray[Any]:
+        """The numbers (H, W) of a depth image."""
+        if path.suffix.lower() == ".exr":
+            return read_exr_depth(path, size)
+        return read_image(path, size=size)
 
     @property
     def _size(self) -> tuple[int, int]:
@@ -210,7 +238,7 @@ class NativeSource(FileSource):
     ) -> tuple[camera_file.CameraFile, Camera | None]:
         path = self.folder / "camera.json"
         if not self.is_clouds:
-            return camera_file.load_camera(camera_path or path)
+            return camera_file.load_camera(camera_path or path, size_of_images=self._size_of_images)
         if camera_path is not None:
             raise InputError(
                 "does not apply to a recording of clouds", where="--camera", remedy="leave it out"
@@ -327,7 +355,7 @@ class NativeSource(FileSource):
 
 @part("reader", "native", label="validated")
 class Native(Reader):
-    """Folders with a camera.json and depth/ (PNG, or .npy) or cloud/ (PLY)."""
+    """Folders with a camera.json and depth/ (PNG, .npy or .exr) or cloud/ (PLY)."""
 
     joinable = True
 
@@ -350,7 +378,8 @@ class Native(Reader):
             return Sniff(
                 Sniff.UNCERTAIN,
                 "depth/ but no camera.json",
-                "write one (docs/formats.md), or use --format native and --camera camera.json",
+                "use --camera camera.json (docs/formats.md), or a file of OpenCV or ROS",
+                needs_camera=True,
             )
         return Sniff(Sniff.CERTAIN, "cloud/") if images == "cloud" else None
 

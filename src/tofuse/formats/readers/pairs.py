@@ -30,7 +30,7 @@ class Pairs(Reader):
         if reading.is_file(path / "camera.json"):
             return Sniff(1.0, f"{evidence} and camera.json")
         remedy = "use --format pairs with --camera camera.json, which states lens and depth_unit_m"
-        return Sniff(Sniff.UNCERTAIN, evidence, remedy)
+        return Sniff(Sniff.UNCERTAIN, evidence, remedy, needs_camera=True)
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""

@@ -17,7 +17,7 @@ from tofuse.engine.geometry import quaternion
 from tofuse.engine.parts import part
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
-from tofuse.formats.images import as_color, parse_exr, parse_image
+from tofuse.formats.images import as_color, parse_image, read_exr_depth
 from tofuse.formats.sources import FileSource, Reader, ReaderOptions, Sniff, inputs, phones, pixels
 
 MAX_MEMBER_BYTES = 1 << 26
@@ -128,12 +128,7 @@ class _Folder:
 
     def depth(self, number: int, size: tuple[int, int]) -> Float32:
         path = self.files[number]
-        channels = parse_exr(reading.read_bytes(path, limit=MAX_MEMBER_BYTES), path)
-        # A grey image has one channel, of any name.
-        depth = next((channels[n] for n in ("R", "Z", "Y") if n in channels), None)
-        if depth is None:
-            depth = next(iter(channels.values()))
-        return _checked(depth, size, path)
+        return _checked(read_exr_depth(path), size, path)
 
     def confidence(self, number: int, size: tuple[int, int]) -> None:
         return None

@@ -36,6 +36,7 @@ class Tiff(Reader):
             Sniff.UNCERTAIN,
             f"{len(files)} .tif files",
             "use --format tiff and --camera camera.json",
+            needs_camera=True,
         )
 
     def open(self, path: Path, options: ReaderOptions) -> TiffSource:
@@ -66,7 +67,11 @@ class TiffSource(FileSource):
     def __init__(
         self, folder: Path, depth: Sequence[Path], amplitude: Sequence[Path], camera: Path
     ) -> None:
-        description = self.use_camera(camera)
+        nothing = InputError("has no images", where=folder)
+        description = self.use_camera(
+            camera,
+            size_of_images=lambda: reading.first_readable(depth, read_tiff, nothing).shape[::-1],
+        )
         super().__init__(np.arange(len(depth)) / (description.frame_rate_hz or 1.0))
         self.depth, self.amplitude = list(depth), list(amplitude)
         self.amplitude_kind = description.amplitude_kind or "raw"

@@ -17,7 +17,7 @@ from tofuse.engine.bounds import Bounds
 from tofuse.engine.errors import InputError, UnreadableFrameError, signals_as_themselves
 from tofuse.engine.frames import NOISE_MODEL, CloudFrame, Frame, RangeFrame, Recording, Source
 from tofuse.engine.parts import check_number, discover, name_of, registered
-from tofuse.formats.cameras import read_noise
+from tofuse.formats.cameras import camera_file, read_noise
 from tofuse.formats.files import reading
 from tofuse.formats.geometry import is_surface, read_surface, surface_points
 from tofuse.formats.poses import TimedPoses, read_poses
@@ -47,6 +47,26 @@ CLOSED = {
     ),
 }
 
+# What is exported instead of a recording: problem, remedy, and suffixes of files.
+_NO_DEPTH = (
+    (
+        "is a model, not a recording",
+        "export the depth images of which it was made (of phones: docs/iphone.md); `tofuse "
+        "register` and `tofuse compare` take models",
+        {".obj", ".mtl", ".stl", ".glb", ".gltf", ".usdz", ".usd", ".fbx", ".dae", ".off"},
+    ),
+    (
+        "is a video, without depth",
+        "export the recording with its depth images (of phones: docs/iphone.md)",
+        {".mov", ".mp4", ".m4v", ".avi", ".webm"},
+    ),
+    (
+        "is of photos, without depth",
+        "export the depth images, too (of phones: docs/iphone.md)",
+        {".jpg", ".jpeg", ".heic", ".dng", ".webp"},
+    ),
+)
+
 _ARCHIVES = {".zip", ".tar", ".gz", ".tgz", ".7z", ".rar"}
 
 # A single file of these, which contain a whole recording, is that of its folder.
@@ -54,14 +74,17 @@ _CONTAINERS = (".bag", ".db3", ".mcap", ".mkv", ".sens", ".r3d", ".npz", ".h5", 
 # What to do with files that are not read, by suffix.
 _REMEDIES = {
     **dict.fromkeys(
-        (".txt", ".csv"), "if the lines are x y z of a cloud, rename the files to .xyz"
+        (".txt", ".csv"),
+        "if the lines are x y z of a cloud, rename the files to .xyz, or use --format xyz "
+        "for a single one",
     ),
+    ".npz": "name its arrays depth, K and, for whole numbers, depth_unit_m (docs/formats.md)",
     ".npy": "save depth and K by numpy.savez, or put a file for each image into depth/ beside a "
     "camera.json (docs/formats.md)",
 }
 
 # A folder with these may contain depth images of an unknown camera.
-_IMAGES = (".png", ".pgm", ".tif", ".tiff", ".jpg", ".jpeg")
+_IMAGES = (".png", ".pgm", ".tif", ".tiff")
 
 
 def readers() -> dict[str, Reader]:
@@ -139,12 +162,14 @@ def open_recording(
         return Recording.of(cameras, shown_path, "rig", again)
     for path in inner:
         _check_kind(path)
-    located = [item for path in inner for item in _resolve(path, format)]
+    located = [item for path in inner for item in _resolve(path, format, options)]
     sources = [_opened(item, options) for item in located]
     source: Source = sources[0]
     if len(sources) > 1:
         source = JoinedSource(sources, _short_names([item.path for item in located]))
     _check_usable(source, paths[0])
+    if options.camera is not None and (assumption := camera_file.assumption(options.camera)):
+        source.warnings.append(assumption)
     if len(inner) == 1:
         _read_noise(source, inner[0])
     if min_depth is not None or max_depth is not None:
@@ -172,7 +197,7 @@ def _rig_source(
                 where=rig_file.parent,
                 remedy=f"put it into {path}, or remove the camera from {rig_file.name}",
             )
-        located = _resolve(path, format)
+        located = _resolve(path, format, options)
         if len(located) > 1:
             raise InputError("contains several recordings", where=path, remedy="leave one")
         source = _opened(located[0], options)
@@ -218,7 +243,11 @@ def _check_kind(path: Path) -> None:
         )
 
 
-def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
+def _resolve(
+    path: Path,
+    format: str | None,  # noqa: A002
+    options: ReaderOptions,
+) -> list[_Located]:
     """The recordings at a path, each with its reader."""
     try:
         path.stat()
@@ -231,7 +260,7 @@ def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
         raise InputError("is an empty folder", where=path, remedy="pass a recording")
     if format is not None:
         return _resolve_as(path, format)
-    sniffs = _sniff(path)
+    sniffs = _sniff(path, options)
     # A camera.json or names of one format outweigh a cloud in the same folder.
     best = max((sniff.confidence for sniff in sniffs.values()), default=0.0)
     confident = {
@@ -255,10 +284,10 @@ def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
             where=path,
             remedy=f"use --format {' or '.join(confident)}",
         )
-    if not sniffs and (parts := _recordings_in(path)):
+    if not sniffs and (parts := _recordings_in(path, options)):
         return parts
     if not sniffs and len(children) == 1 and reading.is_folder(children[0]):
-        return _resolve(children[0], format)
+        return _resolve(children[0], format, options)
     suffixes = {p.suffix.lower() for p in (children or [path]) if p.is_file()}
     if suffixes and suffixes <= _ARCHIVES:
         raise InputError(
@@ -268,6 +297,11 @@ def _resolve(path: Path, format: str | None) -> list[_Located]:  # noqa: A002
         )
     for suffix in suffixes & CLOSED.keys():
         problem, remedy = CLOSED[suffix]
+        raise InputError(problem, where=path, remedy=remedy)
+    exported = set[str]().union(*(kind for _, _, kind in _NO_DEPTH))
+    alone = not (sniffs or _folders_in(path) or _is_sure(path.absolute().parent))
+    if alone and suffixes and suffixes <= exported:
+        problem, remedy = next((p, r) for p, r, kind in _NO_DEPTH if kind & suffixes)
         raise InputError(problem, where=path, remedy=remedy)
     raise _unidentified(path, sniffs, children)
 
@@ -301,9 +335,12 @@ def _sniff_as(reader: Reader, path: Path) -> Sniff | None:
         return None
 
 
-def _sniff(path: Path) -> dict[str, Sniff]:
-    sniffs = {name: _sniff_as(reader, path) for name, reader in readers().items()}
-    return {name: sniff for name, sniff in sniffs.items() if sniff is not None}
+def _sniff(path: Path, options: ReaderOptions | None = None) -> dict[str, Sniff]:
+    found = {name: _sniff_as(reader, path) for name, reader in readers().items()}
+    sniffs = {name: sniff for name, sniff in found.items() if sniff is not None}
+    if options is None or options.camera is None:
+        return sniffs
+    return {name: sniff.with_camera() for name, sniff in sniffs.items()}
 
 
 def _is_sure(path: Path) -> bool:
@@ -316,12 +353,12 @@ def is_recording(path: Path) -> bool:
     return any(sniff.confidence >= Sniff.CERTAIN for sniff in _sniff(path).values())
 
 
-def _recordings_in(path: Path) -> list[_Located]:
+def _recordings_in(path: Path, options: ReaderOptions) -> list[_Located]:
     """The recordings in a folder, if any; InputError if there are several that can't be joined."""
     format_of: dict[Path, str] = {}
     best = 0.0
     for part in [*_folders_in(path), *inputs.files_at(path, *_CONTAINERS)]:
-        sniffs = _sniff(part)
+        sniffs = _sniff(part, options)
         confident = [name for name, s in sniffs.items() if s.confidence >= Sniff.CERTAIN]
         if confident:
             format_of[part] = max(confident, key=lambda name: sniffs[name].confidence)
@@ -361,6 +398,11 @@ def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) ->
         remedy = _REMEDIES.get(most.lower(), remedy)
         if any(kind.lower() in _IMAGES for kind in kinds):
             remedy = "if these are depth images, move them to depth/ in it and add a camera.json"
+        for child in _folders_in(path):
+            if any(sniff.needs_camera for sniff in _sniff(child).values()):
+                remedy = f"if the depth images are in {child.name}/, use --camera camera.json "
+                remedy += "(docs/formats.md), or a file of OpenCV or ROS"
+                break
     elif path.stat().st_size == 0:
         return InputError("is empty", where=path, remedy="copy the file again")
     else:

@@ -188,5 +188,10 @@ class CloudReader(Reader):
 
 
 def required_files(path: Path, *suffixes: str) -> list[Path]:
-    """Return the files at a path, see `inputs.files_at`; InputError if there are none."""
+    """Return the files at a path, see `inputs.files_at`; InputError if there are none.
+
+    A file that the user passes for one of a format is that, whatever it is called.
+    """
+    if reading.is_file(path):
+        return [path]
     return inputs.required(inputs.files_at(path, *suffixes), f"{suffixes[0]} files", path)

@@ -16,7 +16,7 @@ from tofuse.engine.frames import AmplitudeKind, DepthKind, Frame, RangeFrame, de
 from tofuse.engine.quantities import count
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
-from tofuse.formats.images import check_first_size, read_color, read_image
+from tofuse.formats.images import check_first_size, first_size, read_color, read_image
 from tofuse.formats.sources.inputs import read_timestamps, tum_poses
 from tofuse.formats.sources.pixels import resized, sampled_color
 from tofuse.formats.sources.reader import ReaderOptions
@@ -66,9 +66,14 @@ class FileSource(ABC):
     def load(self, index: int) -> Frame:
         """Read frame `index`; raise InputError if it can't be read."""
 
-    def use_camera(self, path: Path, size: tuple[int, int] | None = None) -> camera_file.CameraFile:
+    def use_camera(
+        self,
+        path: Path,
+        size: tuple[int, int] | None = None,
+        size_of_images: camera_file.SizeOf | None = None,
+    ) -> camera_file.CameraFile:
         """Take camera, unit and kind of depth from a camera.json; see `load_camera`."""
-        description, self.camera = camera_file.load_camera(path, size)
+        description, self.camera = camera_file.load_camera(path, size, size_of_images)
         self.unit, self.kind = description.depth_unit_m, description.depth_kind
         self.color_camera = description.color or self.color_camera
         return description
@@ -203,7 +208,10 @@ class DepthImageSource(FileSource):
         self.color_registered, self.color_camera = color_registered, color_camera
         where = "the camera of this format"
         if options is not None and options.camera is not None:
-            sensor = self.use_camera(options.camera).sensor or sensor
+            description = self.use_camera(
+                options.camera, size_of_images=lambda: first_size(self.files)
+            )
+            sensor = description.sensor or sensor
             where = str(options.camera)
         elif camera is None:
             raise InputError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, Protocol
 
@@ -22,6 +22,8 @@ class Sniff:
         The evidence for the format, for messages.
     remedy
         What to do if the confidence is below `CERTAIN`.
+    needs_camera
+        Whether it would be certain if the user passed a camera.
     """
 
     CERTAIN: ClassVar[float] = 0.9
@@ -30,6 +32,13 @@ class Sniff:
     confidence: float
     evidence: str
     remedy: str = ""
+    needs_camera: bool = False
+
+    def with_camera(self) -> Sniff:
+        """Return the guess if the user passed a camera; of several the order remains."""
+        if not self.needs_camera:
+            return self
+        return replace(self, confidence=self.CERTAIN + (1 - self.CERTAIN) * self.confidence)
 
 
 @dataclass(frozen=True)
