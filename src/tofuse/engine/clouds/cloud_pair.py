@@ -306,9 +306,12 @@ def _registered_views(
         poses.append(views.evaluated(image_registration.T_target_source))
     proposed, found = _proposed(views, start, guessed=guess is not None)
     poses += proposed
+    more = [] if found is None else list(found.poses[_MAX_REFINED:_MANY_REFINED])
+    if not _may_be_likely(views, poses, found):
+        poses += [views.refined(c.T_target_source) for c in more]
+        more = []
     best = _best(views, poses, found, local, guess, certain)
-    more = [] if found is None else found.poses[_MAX_REFINED:_MANY_REFINED]
-    if (best.probability or 0.0) >= _LIKELY:
+    if more and (best.probability or 0.0) >= _LIKELY:
         is_rival = partial(views.are_distinct_poses, best.T_target_source)
         # Without a rival, its lead is unknown.
         has_rival = any(is_rival(pose.T_target_source) for pose in proposed)
@@ -317,6 +320,13 @@ def _registered_views(
         poses += [views.refined(c.T_target_source) for c in more]
         best = _best(views, poses, found, local, guess, certain)
     return views.with_information(best)
+
+
+def _may_be_likely(views: _CloudViews, poses: list[_Pose], found: Candidates | None) -> bool:
+    """Whether the best pose is likely if no better rival than the other poses is found."""
+    best, *others = _ranked(poses, found)
+    rivals = [p for p in others if views.are_distinct_poses(p.T_target_source, best.T_target_source)]
+    return views.evidence(best, 1.0, rivals=rivals).probability >= _LIKELY
 
 
 def _best(
