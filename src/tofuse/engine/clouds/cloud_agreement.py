@@ -59,6 +59,11 @@ class CloudAgreement(pair_agreement.Agreement):
         """Fraction of the surfaces near each other that coincide."""
         return self.surfaces / max(self.near_surfaces, 1e-9)
 
+    @property
+    def uncontradicted_surfaces(self) -> float:
+        """Number of surfaces that coincide, less as many as free space contradicts."""
+        return self.surfaces * min(max(self.score, 0.0) / max(self.support, 1e-9), 1.0)
+
 
 @dataclass(frozen=True, eq=False)
 class CloudMap:

@@ -103,9 +103,7 @@ class _Pose:
 
         Walls and floors coincide in many poses, however many points are on them.
         """
-        agreement = self.agreement
-        uncontradicted = max(agreement.score, 0.0) / max(agreement.support, 1e-9)
-        surfaces = agreement.surfaces * min(uncontradicted, 1.0)
+        surfaces = self.agreement.uncontradicted_surfaces
         return float(np.log1p(surfaces) + _MATCH_RANK * log_matches(self.matches))
 
 
@@ -514,17 +512,18 @@ def _fits_as_well(rival: CloudAgreement, agreement: CloudAgreement) -> bool:
 
 
 def _surfaces_of(rival: CloudAgreement, agreement: CloudAgreement) -> float:
-    """Return the surfaces that coincide at a rival pose.
+    """Return the surfaces that coincide at a rival pose and that free space does not contradict.
 
     Where a structure repeats, the clouds fit as well one repetition further, only over less of it.
     That less overlaps is no evidence against that pose: its surfaces are counted as if as many were
     near each other. A fraction of few surfaces may be chance, and is taken for a smaller one.
     """
+    surfaces = rival.uncontradicted_surfaces
     if not _fits_as_well(rival, agreement):
-        return rival.surfaces
+        return surfaces
     few = pose_probability.FEW_SURFACES
     nearby = min(rival.near_surfaces, agreement.near_surfaces) + few
-    return rival.surfaces * (agreement.near_surfaces + few) / nearby
+    return surfaces * (agreement.near_surfaces + few) / nearby
 
 
 def symmetries(view: Frame) -> Float64:
