@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.clouds import distinct_surfaces
 from tofuse.engine.clouds.fpfh import MAX_VIOLATION, VIOLATION_WEIGHT
 from tofuse.engine.clouds.viewpoint import RangeSphere, Viewpoint, free_space_viewpoint
 from tofuse.engine.frames import CloudFrame, Frame
@@ -33,8 +34,6 @@ _SIGMAS, _CURVATURE_TOLERANCE = 3.0, 0.25
 _MAX_DISTANCE = 2.0
 # Cosine of the largest angle between normals of surfaces that support each other.
 _MIN_NORMAL_COSINE = 0.75
-# Cosine of the largest angle between normals of points on one plane, and points compared at once.
-_COPLANAR_COSINE, _CHUNK = 0.9, 500
 # A point is in free space if it lies in front of the surface by more than this fraction of the
 # range plus the tolerance.
 _IN_FRONT = 0.02
@@ -42,10 +41,7 @@ _IN_FRONT = 0.02
 
 @dataclass(frozen=True)
 class CloudAgreement(pair_agreement.Agreement):
-    """Agreement of two clouds, also by distinct surfaces.
-
-    Two walls and a floor can be laid over those of any other room, whatever fraction of the points
-    lies on them. So all points on one plane count as one surface, and those beside it by as much.
+    """Agreement of two clouds, also by distinct surfaces (`distinct_surfaces`).
 
     Attributes
     ----------
@@ -62,6 +58,11 @@ class CloudAgreement(pair_agreement.Agreement):
     def coincidence(self) -> float:
         """Fraction of the surfaces near each other that coincide."""
         return self.surfaces / max(self.near_surfaces, 1e-9)
+
+    @property
+    def uncontradicted_surfaces(self) -> float:
+        """Number of surfaces that coincide, less as many as free space contradicts."""
+        return self.surfaces * min(max(self.score, 0.0) / max(self.support, 1e-9), 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,15 +122,8 @@ class CloudMap:
 
     @cached_property
     def surface_share(self) -> Float64:
-        """Share (n,) of each compared point in its plane: 1 / number of them on that."""
-        points, normals = self.compared
-        count = np.empty(len(points))
-        for k in range(0, len(points), _CHUNK):
-            p, n = points[k : k + _CHUNK], normals[k : k + _CHUNK]
-            beside = np.abs((p * n).sum(1)[:, None] - n @ points.T)
-            parallel = np.abs(n @ normals.T) > _COPLANAR_COSINE
-            count[k : k + _CHUNK] = (parallel & (beside < tolerance(self, self))).sum(1)
-        return 1 / np.maximum(count, 1)
+        """Share (n,) of each compared point in its plane, see `distinct_surfaces`."""
+        return distinct_surfaces.shares(*self.compared, tolerance(self, self))
 
 
 def _tested_points(view: CloudFrame, shape: surface_shape.Shape, viewpoint: Float64) -> Float64:

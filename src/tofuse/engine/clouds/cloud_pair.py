@@ -103,9 +103,7 @@ class _Pose:
 
         Walls and floors coincide in many poses, however many points are on them.
         """
-        agreement = self.agreement
-        uncontradicted = max(agreement.score, 0.0) / max(agreement.support, 1e-9)
-        surfaces = agreement.surfaces * min(uncontradicted, 1.0)
+        surfaces = self.agreement.uncontradicted_surfaces
         return float(np.log1p(surfaces) + _MATCH_RANK * log_matches(self.matches))
 
 
@@ -309,9 +307,12 @@ def _registered_views(
         poses.append(views.evaluated(image_registration.T_target_source))
     proposed, found = _proposed(views, start, guessed=guess is not None)
     poses += proposed
+    more = [] if found is None else list(found.poses[_MAX_REFINED:_MANY_REFINED])
+    if not _may_be_likely(views, poses, found):
+        poses += [views.refined(c.T_target_source) for c in more]
+        more = []
     best = _best(views, poses, found, local, guess, certain)
-    more = [] if found is None else found.poses[_MAX_REFINED:_MANY_REFINED]
-    if (best.probability or 0.0) >= _LIKELY:
+    if more and (best.probability or 0.0) >= _LIKELY:
         is_rival = partial(views.are_distinct_poses, best.T_target_source)
         # Without a rival, its lead is unknown.
         has_rival = any(is_rival(pose.T_target_source) for pose in proposed)
@@ -320,6 +321,13 @@ def _registered_views(
         poses += [views.refined(c.T_target_source) for c in more]
         best = _best(views, poses, found, local, guess, certain)
     return views.with_information(best)
+
+
+def _may_be_likely(views: _CloudViews, poses: list[_Pose], found: Candidates | None) -> bool:
+    """Whether the best pose is likely if no better rival than the other poses is found."""
+    best, *others = _ranked(poses, found)
+    rivals = [p for p in others if views.are_distinct_poses(p.T_target_source, best.T_target_source)]
+    return views.evidence(best, 1.0, rivals=rivals).probability >= _LIKELY
 
 
 def _best(
@@ -506,17 +514,18 @@ def _fits_as_well(rival: CloudAgreement, agreement: CloudAgreement) -> bool:
 
 
 def _surfaces_of(rival: CloudAgreement, agreement: CloudAgreement) -> float:
-    """Return the surfaces that coincide at a rival pose.
+    """Return the surfaces that coincide at a rival pose and that free space does not contradict.
 
     Where a structure repeats, the clouds fit as well one repetition further, only over less of it.
     That less overlaps is no evidence against that pose: its surfaces are counted as if as many were
     near each other. A fraction of few surfaces may be chance, and is taken for a smaller one.
     """
+    surfaces = rival.uncontradicted_surfaces
     if not _fits_as_well(rival, agreement):
-        return rival.surfaces
+        return surfaces
     few = pose_probability.FEW_SURFACES
     nearby = min(rival.near_surfaces, agreement.near_surfaces) + few
-    return rival.surfaces * (agreement.near_surfaces + few) / nearby
+    return surfaces * (agreement.near_surfaces + few) / nearby
 
 
 def symmetries(view: Frame) -> Float64:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from tofuse.engine import quantities
 from tofuse.engine.arrays import Float32, Float64, Int64
+from tofuse.engine.clouds import distinct_surfaces
 from tofuse.engine.clouds import fpfh_kernels as kernels
 from tofuse.engine.clouds.robust_motion import (
     Consensus,
@@ -55,6 +56,8 @@ _IN_FRONT, _IN_FRONT_RANGE = 2.5, 0.03
 VIOLATION_WEIGHT, MAX_VIOLATION = 20.0, 0.05
 # Weight of the log of the matches that agree with a pose, and of those that do by chance.
 MATCH_WEIGHT, _CHANCE_MATCHES = 0.1, 5.0
+# Weight of the log of the distinct surfaces that fit.
+_SURFACE_WEIGHT = 0.5
 
 
 def candidates(
@@ -120,6 +123,7 @@ def candidates(
     first, second = described
     fits = 0.5 * (_fit(first, second, T, size) + _fit(second, first, se3.inverse(T), size))
     score = fits[0] - VIOLATION_WEIGHT * np.minimum(fits[1], MAX_VIOLATION)
+    score += _SURFACE_WEIGHT * np.log1p(fits[2])
     score += MATCH_WEIGHT * log_matches([c.score for c in found])
     best = np.argsort(-score, kind="stable")
     ranked = tuple(Candidate(T[k], float(fits[0, k]), found[k]) for k in best)
@@ -291,10 +295,11 @@ def _smallest(distance: Float32, count: int) -> Int64:
 
 
 def _fit(view: DescribedCloud, other: DescribedCloud, T: Float64, size: float) -> Float64:
-    """Return how well a view fits the other at poses T (k, 4, 4) that map it there, (2, k).
+    """Return how well a view fits the other at poses T (k, 4, 4) that map it there, (3, k).
 
     The first row is the mean over its points of 1 - (distance / limit)^2 where the normals agree,
-    the second the fraction of them in the other's free space.
+    the second the fraction of them in the other's free space, the third the sum over its distinct
+    surfaces of the former.
     """
     chosen = slice(None, None, max(1, len(view.points) // _FIT_POINTS))
     points = se3.transform(T, view.points[chosen])
@@ -309,4 +314,5 @@ def _fit(view: DescribedCloud, other: DescribedCloud, T: Float64, size: float) -
         ranges = np.linalg.norm(points - other.sphere.origin, axis=2)
         front = other.sphere.distance_in_front(points.reshape(-1, 3)).reshape(ranges.shape)
         violation = (front > _IN_FRONT * size + _IN_FRONT_RANGE * ranges).mean(1)
-    return np.stack([fits.mean(1), violation])
+    shares = distinct_surfaces.shares(view.points[chosen], view.normals[chosen], size)
+    return np.stack([fits.mean(1), violation, fits @ shares])
