@@ -514,18 +514,18 @@ def _fits_as_well(rival: CloudAgreement, agreement: CloudAgreement) -> bool:
 
 
 def _surfaces_of(rival: CloudAgreement, agreement: CloudAgreement) -> float:
-    """Return the surfaces that coincide at a rival pose and that free space does not contradict.
+    """Return the surfaces that coincide at a rival pose.
 
     Where a structure repeats, the clouds fit as well one repetition further, only over less of it.
     That less overlaps is no evidence against that pose: its surfaces are counted as if as many were
-    near each other. A fraction of few surfaces may be chance, and is taken for a smaller one.
+    near each other. A fraction of few surfaces may be chance, and is taken for a smaller one. Where
+    a smaller fraction coincides, free space counts as well.
     """
-    surfaces = rival.uncontradicted_surfaces
     if not _fits_as_well(rival, agreement):
-        return surfaces
+        return rival.uncontradicted_surfaces
     few = pose_probability.FEW_SURFACES
     nearby = min(rival.near_surfaces, agreement.near_surfaces) + few
-    return surfaces * (agreement.near_surfaces + few) / nearby
+    return rival.surfaces * (agreement.near_surfaces + few) / nearby
 
 
 def symmetries(view: Frame) -> Float64:
