@@ -326,7 +326,9 @@ def _registered_views(
 def _may_be_likely(views: _CloudViews, poses: list[_Pose], found: Candidates | None) -> bool:
     """Whether the best pose is likely if no better rival than the other poses is found."""
     best, *others = _ranked(poses, found)
-    rivals = [p for p in others if views.are_distinct_poses(p.T_target_source, best.T_target_source)]
+    rivals = [
+        p for p in others if views.are_distinct_poses(p.T_target_source, best.T_target_source)
+    ]
     return views.evidence(best, 1.0, rivals=rivals).probability >= _LIKELY
 
 
