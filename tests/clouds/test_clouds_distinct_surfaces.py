@@ -32,7 +32,7 @@ def test_a_fit_of_many_surfaces_is_told_from_that_of_one():
     """As many points fit, but at one pose they are all on one wall."""
     wall, _ = plane(100, Z)
     turns = np.random.default_rng(0).normal(size=(100, 3))
-    points = np.concatenate([wall, wall + [0, 0, 5.0]])
+    points = np.concatenate([wall, wall + 5.0 * Z])
     normals = np.concatenate([np.tile(Z, (100, 1)), turns / np.linalg.norm(turns, axis=1)[:, None]])
     histograms = np.zeros((200, 1))
     view = fpfh.DescribedCloud(points, normals, histograms)
