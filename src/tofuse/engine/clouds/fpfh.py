@@ -298,8 +298,8 @@ def _fit(view: DescribedCloud, other: DescribedCloud, T: Float64, size: float) -
     """Return how well a view fits the other at poses T (k, 4, 4) that map it there, (3, k).
 
     The first row is the mean over its points of 1 - (distance / limit)^2 where the normals agree,
-    the second the fraction of them in the other's free space, the third the sum over its distinct
-    surfaces of the former.
+    the second the fraction of them in the other's free space, the third the number of distinct
+    surfaces that fit: the sum of what the first is the mean of, by the shares of the points.
     """
     chosen = slice(None, None, max(1, len(view.points) // _FIT_POINTS))
     points = se3.transform(T, view.points[chosen])
