@@ -7,20 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from made_lens_files import OPENCV, written
 from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import BrownConrady
 from tofuse.formats.cameras.camera_file import load_camera
-
-OPENCV = """{{
- "image_size": [64, 48],
- "camera_matrix": [[50.0, 0, 31.0], [0, 51.0, 23.0], [0, 0, 1]],
- "dist_coeffs": [{k}]
-}}"""
-
-
-def written(folder: Path, name: str, text: str) -> Path:
-    (folder / name).write_text(text)
-    return folder / name
 
 
 def test_size_that_the_file_lacks_is_that_of_the_recording(

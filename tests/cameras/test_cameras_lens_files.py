@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from made_lens_files import OPENCV, written
 from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Rational
 from tofuse.engine.errors import InputError
 from tofuse.formats.cameras.camera_file import load_camera, read_lens_file
@@ -30,18 +31,6 @@ rectification_matrix:
   cols: 3
   data: [1, 0, 0, 0, 1, 0, 0, 0, 1]
 """
-
-
-OPENCV = """{{
- "image_size": [64, 48],
- "camera_matrix": [[50.0, 0, 31.0], [0, 51.0, 23.0], [0, 0, 1]],
- "dist_coeffs": [{k}]
-}}"""
-
-
-def written(folder: Path, name: str, text: str) -> Path:
-    (folder / name).write_text(text)
-    return folder / name
 
 
 @pytest.mark.parametrize("suffix", ["yml", "xml", "json"])

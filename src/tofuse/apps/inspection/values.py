@@ -78,9 +78,8 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
             {"roughness_if_swapped": ratio},
         )
         return
-    if (
-        mixed := _mixed_units([f for f in sample.frames if not isinstance(f, RangeFrame)])
-    ) is not None:
+    mixed = _mixed_units([f for f in sample.frames if not isinstance(f, RangeFrame)])
+    if mixed is not None:
         yield mixed
         return
     median = float(np.median(depths))

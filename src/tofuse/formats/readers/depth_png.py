@@ -17,7 +17,6 @@ _CAMERA = (
     "if these are depth images, use --camera camera.json with lens, depth_unit_m and depth_kind, "
     "or a file of OpenCV or ROS"
 )
-
 _SAMPLES = 16  # number of images that tell whether a folder has depth
 
 
