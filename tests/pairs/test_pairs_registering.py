@@ -170,6 +170,8 @@ def test_known_factor_of_the_unit_is_exact(tmp_path, capfd) -> None:
     assert "exclusive" in capfd.readouterr().err
     with pytest.raises(InputError, match="scale"):
         tofuse.register(source, target, scale=-1.0)
+    unscaled = tofuse.register(source, target, scale=np.False_)  # of NumPy: no factor
+    assert unscaled.scale_sigma is None
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".glb"])

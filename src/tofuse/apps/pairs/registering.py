@@ -97,10 +97,10 @@ def register(
     check_number(seed, Bounds(0), "seed", whole=True)
     check_number(risk, RISKS, "risk")
     start = None if guess is None else se3.check_pose(guess, where="guess")
-    factor = None if isinstance(scale, bool) else scale
+    factor = None if isinstance(scale, bool | np.bool_) else scale
     moving = at_factor(view_of(source, "source"), factor, "scale")
     near = NearOrigin.of(moving, view_of(target, "target"), start)
-    if scale is True:
+    if scale and factor is None:
         near, registration = registered_scaled(near, method, seed)
     else:
         registration = registered_near(near, registrar_of(method), seed)
