@@ -147,9 +147,7 @@ class Reference:
         triangles, source = _divided(corners, size)
         normals = unit_vectors(cross)[source]
         if has_faces:
-            octant = np.abs(normals @ _AXES).argmax(1)
-            sign = np.take_along_axis(normals @ _AXES, octant[:, None], 1)[:, 0] > 0
-            region = label[source] * 6 + 2 * octant + sign
+            region = label[source] * 6 + directions(normals @ _AXES)
         else:
             region, edges = _cells(triangles.mean(1), normals), np.zeros((0, 3))
         sigma = surface.sigma
@@ -309,9 +307,14 @@ def _cells(points: Float64, normals: Float64) -> Intp:
     """Return the region of each place of a surface without faces: by its cell and direction."""
     edge = max(_REGION_FRACTION * float(np.linalg.norm(np.ptp(points, axis=0))), 1e-9)
     cell = np.floor((points - points.min(0)) / edge).astype(np.int64)
-    axis = np.abs(normals @ _AXES).argmax(1)
-    sign = np.take_along_axis(normals @ _AXES, axis[:, None], 1)[:, 0] > 0
-    return np.asarray(((cell[:, 0] * 8 + cell[:, 1]) * 8 + cell[:, 2]) * 6 + 2 * axis + sign)
+    place = (cell[:, 0] * 8 + cell[:, 1]) * 8 + cell[:, 2]
+    return np.asarray(place * 6 + directions(normals @ _AXES))
+
+
+def directions(normals: Float64) -> Intp:
+    """(N,) number of the axis, and its sign, that each normal is nearest to."""
+    axis = np.abs(normals).argmax(1)
+    return np.asarray(2 * axis + (np.take_along_axis(normals, axis[:, None], 1)[:, 0] > 0))
 
 
 def measured_points(surface: Surface, reference: Reference) -> Surface:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from tofuse.apps.compare.nearest import Distances, Reference
+from tofuse.apps.compare.nearest import Distances, Reference, directions
 from tofuse.apps.report import scene
 from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.connections import parts_of
@@ -122,7 +122,7 @@ def _beyond(
     It is 0 where that may be a support, or is too near for what is known.
     """
     made = np.zeros(len(points))
-    direction = _directions(normals)
+    direction = directions(normals)
     rest = np.flatnonzero(~found.compared)
     # Places of one direction each: between a table and what stands on it there is none.
     key = np.column_stack([np.floor(points[rest] / size).astype(np.int64), direction[rest]])
@@ -198,12 +198,6 @@ def _behind(
         if len(left) < FEWEST:
             break
     return np.where(np.isfinite(behind), behind, 0.0)
-
-
-def _directions(normals: Float64) -> Intp:
-    """(N,) number of the axis, and its sign, that each normal is nearest to."""
-    axis = np.abs(normals).argmax(1)
-    return np.asarray(2 * axis + (np.take_along_axis(normals, axis[:, None], 1)[:, 0] > 0))
 
 
 def _hides(reference: Reference, places: Float64, facing: Float64, oriented: bool) -> Bool:

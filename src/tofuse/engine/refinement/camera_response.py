@@ -20,7 +20,7 @@ from tofuse.engine.arrays import Float32, Float64, Intp
 from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import sparse
-from tofuse.engine.refinement.joint_alignment import DAMPING, Priors, weak_prior
+from tofuse.engine.refinement.joint_alignment import Priors, weak_prior
 from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 
@@ -255,15 +255,7 @@ class Linearised:
         H, g = state.without_exposure(range(kernels.ERRORS))
         i, j = system.pairs.T
         T_i_j = se3.inverse(poses[i]) @ poses[j]
-        prior_H, prior_g = priors.equations(T_i_j[len(H) :])
-        matrix, gradient = system.relative(
-            np.concatenate([H[:, :6, :6], prior_H]),
-            np.concatenate([g[:, :6], prior_g]),
-            T_i_j,
-            weak_prior(len(poses)),
-        )
-        factor = system.factor(matrix, gradient, DAMPING)
-        assert factor is not None, "every pose has a prior, so the system is not singular"
+        factor = priors.factor(system, H[:, :6, :6], g[:, :6], T_i_j, weak_prior(len(poses)))
         # Reweighted least squares holds the weights constant, and their curvature exceeds that of
         # the cost. A single step with it falls short, and a sandwich estimate by it is too small
         # (Huber 1981, Robust Statistics, section 3.2: the mean of psi').

@@ -63,6 +63,29 @@ class Priors:
         """Return the normal equations (M, 6, 6), (M, 6) at relative poses (M, 4, 4)."""
         return sparse.equations(se3.log(se3.inverse(self.measured) @ T_i_j), self.information)
 
+    def factor(
+        self,
+        system: sparse.PairSystem,
+        H: Float64,
+        g: Float64,
+        T_i_j: Float64,
+        unary: tuple[Float64, Float64],
+    ) -> sparse.Factor:
+        """Factorise a `system` of pairs with normal equations H (m, 6, 6), g (m, 6), and of these.
+
+        Parameters
+        ----------
+        T_i_j
+            (m + M, 4, 4) relative poses.
+        unary
+            Normal equations of single poses, such as `weak_prior`.
+        """
+        prior_H, prior_g = self.equations(T_i_j[len(H) :])
+        equations = np.concatenate([H, prior_H]), np.concatenate([g, prior_g])
+        factor = system.factor(*system.relative(*equations, T_i_j, unary), DAMPING)
+        assert factor is not None, "every pose has a prior, so the system is not singular"
+        return factor
+
 
 def weak_prior(n: int) -> tuple[Float64, Float64]:
     """Return equations (n, 6, 6), (n, 6) that just keep unconstrained poses in place."""
@@ -516,7 +539,6 @@ def _solve(
     n, prior_count = len(poses), len(priors.pairs)
     i, j = system.pairs.T
     T_i_j = se3.inverse(poses[i]) @ poses[j]
-    prior_H, prior_g = priors.equations(T_i_j[len(H) :])
     unary = weak_prior(n)
     shared = _SharedUnknowns(
         [
@@ -530,11 +552,7 @@ def _solve(
     if priors.gravity is not None:
         damping = np.append(damping, np.zeros(2))
         _add_gravity(poses, priors.gravity, unary, shared, system)
-    matrix, gradient = system.relative(
-        np.concatenate([H[:, :6, :6], prior_H]), np.concatenate([g[:, :6], prior_g]), T_i_j, unary
-    )
-    factor = system.factor(matrix, gradient, DAMPING)
-    assert factor is not None, "every pose has a prior, so the system is not singular"
+    factor = priors.factor(system, H[:, :6, :6], g[:, :6], T_i_j, unary)
     # Schur complement: the shared unknowns have a small dense system.
     coupling, schur, reduced_gradient = shared.coupling, shared.H, shared.g
     step = _checked(factor.step())

@@ -36,8 +36,7 @@ class ArkitScenes(Reader):
         """See `Reader.open`."""
         inputs.refuse_camera(options, "arkitscenes", inputs.PER_FRAME)
         folder = _frames(path)
-        depth = folder / "lowres_depth"
-        files = inputs.required(reading.files_with(depth, ".png"), ".png files", depth)
+        files = inputs.depth_images(folder / "lowres_depth")
         times, size = _times(files), first_size(files)
         source = phones.PhoneSource(
             files,

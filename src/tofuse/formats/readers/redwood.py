@@ -56,9 +56,7 @@ class Redwood(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        files = inputs.required(
-            reading.files_with(path / "depth", ".png"), ".png files", path / "depth"
-        )
+        files = inputs.depth_images(path / "depth")
         warnings: list[str] = []
         # Open3D's recorders write this format with other cameras.
         camera = _Camera(PRIMESENSE, sensor=SENSOR if first_size(files) == SIZE else "")

@@ -33,9 +33,7 @@ class ScanNet(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        files = inputs.required(
-            reading.files_with(path / "depth", ".png"), ".png files", path / "depth"
-        )
+        files = inputs.depth_images(path / "depth")
         numbered = all(file.stem.isdecimal() and len(file.stem) <= 9 for file in files)
         numbers = np.array([int(f.stem) for f in files] if numbered else range(len(files)))
         warnings: list[str] = []

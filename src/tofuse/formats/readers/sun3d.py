@@ -34,9 +34,7 @@ class Sun3D(Reader):
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""
-        files = inputs.required(
-            reading.files_with(path / "depth", ".png"), ".png files", path / "depth"
-        )
+        files = inputs.depth_images(path / "depth")
         nothing = InputError("has no images", where=path / "depth")
         _check_rotated(reading.first_readable(files, _read, nothing), path / "depth")
         warnings: list[str] = []

@@ -34,6 +34,11 @@ def required(files: list[T], name: str, where: Path, remedy: str = "check the pa
     return files
 
 
+def depth_images(folder: Path) -> list[Path]:
+    """Return the PNGs in a folder of depth images; InputError if there are none."""
+    return required(reading.files_with(folder, ".png"), ".png files", folder)
+
+
 def refuse_camera(options: ReaderOptions, name: str, stores: str = "points") -> None:
     """Raise InputError if a camera was passed for the format `name`, which stores `stores`."""
     if options.camera is not None:
