@@ -10,7 +10,6 @@ those of `cloud_kinds.py`, with more points.
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -18,15 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.engine.arrays import Float32, Float64
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
 import cloud_kinds
 import pairs
 import scoring
 import tofuse
 from sequences import DATA
+from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.geometry.ply import write_ply
 

@@ -21,17 +21,12 @@ is taken for the viewpoint.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-
-from tofuse.engine.arrays import Float64
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import cloud_belief
 import cloud_kinds
@@ -41,6 +36,7 @@ from cloud_kinds import KINDS, Pair
 from peers import kiss_global, o3d_global, splat_global
 from sequences import DATA
 from tofuse.engine.alignment.base import Registration
+from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds.viewpoint import viewpoint_of
 from tofuse.engine.errors import TofuseError
 from tofuse.engine.frames.frames import CloudFrame, Frame

@@ -16,13 +16,14 @@ The constants were tuned on seeds 0 to 7 and 100 to 116; seeds from 1000 on are 
 from __future__ import annotations
 
 import argparse
-import pickle
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from made_once import computed_once
 from tofuse.engine.alignment.projective import UNITS, ProjectiveOptions, Target, align
 from tofuse.engine.alignment.uncertainty import covariance
 from tofuse.engine.arrays import Float64
@@ -75,14 +76,9 @@ def chains(arguments: argparse.Namespace, noise: str) -> Iterator[tuple[str, int
         kind, seed = KINDS[k % len(KINDS)], arguments.seed + k // len(KINDS)
         name = f"{arguments.camera}-{noise}-{kind}-{seed}.pickle"
         kept = arguments.cache / name if arguments.cache else None
-        if kept is not None and kept.exists():
-            yield kind, seed, pickle.loads(kept.read_bytes())
-            continue
-        made = chain(kind, seed, Effects(noise=noise), arguments.camera)  # type: ignore[arg-type]
-        if kept is not None:
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            kept.write_bytes(pickle.dumps(made))
-        yield kind, seed, made
+        effects = Effects(noise=noise)  # type: ignore[arg-type]
+        make = partial(chain, kind, seed, effects, arguments.camera)
+        yield kind, seed, computed_once(kept, make)
 
 
 @dataclass(frozen=True, eq=False)

@@ -148,18 +148,38 @@ def table(rows: Sequence[tuple[str, Sequence[Usage]]]) -> Iterator[str]:
         yield f"{rows[1][0]} takes {theirs / ours:.1f} times as long"
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--inputs", nargs="+", default=list(INPUTS), help="sequences, or paths of recordings"
-    )
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that select frames, and how they are processed."""
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the recorded sequences")
     parser.add_argument("--start", type=int, default=0)
     parser.add_argument("--end", type=int)
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--no-first", action="store_true", help="count the first run as well")
+
+
+def started(options: argparse.Namespace) -> list[str]:
+    """Keep to as many cores as threads, print where, and return the selection for `tofuse run`."""
+    if hasattr(os, "sched_setaffinity"):  # peers use all that are available
+        cores = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, cores[: options.threads])
+    load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
+    print(
+        f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}; "
+        f"{options.threads} threads{load}",
+        flush=True,
+    )
+    chosen = ["--start", str(options.start), "--every", str(options.every)]
+    return chosen if options.end is None else [*chosen, "--end", str(options.end)]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "--inputs", nargs="+", default=list(INPUTS), help="sequences, or paths of recordings"
+    )
+    add_options(parser)
+    parser.add_argument("--repeats", type=int, default=1)
     parser.add_argument("--no-peer", action="store_true")
     parser.add_argument("--peer", help=argparse.SUPPRESS)
     parser.add_argument("--peer-out", type=Path, help=argparse.SUPPRESS)
@@ -174,17 +194,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             options.threads,
         )
         return
-    if hasattr(os, "sched_setaffinity"):  # peers use all that are available
-        cores = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, cores[: options.threads])
-    load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
-    print(
-        f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}; "
-        f"{options.threads} threads{load}"
-    )
-    chosen = ["--start", str(options.start), "--every", str(options.every)]
-    if options.end is not None:
-        chosen += ["--end", str(options.end)]
+    chosen = started(options)
     methods = [("tofuse run", tofuse_run)]
     if not options.no_peer:
         if importlib.util.find_spec("open3d"):

@@ -15,7 +15,6 @@ is a valid corridor. A recording counts as saturated only if a tenth of its pixe
 from __future__ import annotations
 
 import argparse
-import pickle
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -25,6 +24,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from made_once import computed_once
 from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, ray_lengths, scaled
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
@@ -270,13 +270,8 @@ def taken(kind: str, camera: str, k: int, cache: Path | None) -> Frames:
     if kind == "furnished":
         kind, k = "clean", 5 * (k // 3) + k % 3
     file = None if cache is None else cache / f"{kind}-{camera}-{k:03d}.pkl"
-    if file is not None and file.exists():
-        return pickle.loads(file.read_bytes())
-    makers = {"clean": clean, "turn": turn}
-    frames = (makers.get(kind) or rendered_fault(kind))(camera, k)
-    if file is not None:
-        file.write_bytes(pickle.dumps(frames))
-    return frames
+    make = {"clean": clean, "turn": turn}.get(kind) or rendered_fault(kind)
+    return computed_once(file, lambda: make(camera, k))
 
 
 def finding_codes(frames: Frames, name: str) -> set[str]:
@@ -290,8 +285,6 @@ def main() -> None:
     parser.add_argument("--clean", type=int, default=100)
     parser.add_argument("--only", default="")
     chosen = parser.parse_args()
-    if chosen.cache is not None:
-        chosen.cache.mkdir(parents=True, exist_ok=True)
     begin = time.process_time()
     print("| fault | " + " | ".join(CAMERAS) + " | other findings |")
     print("|---|" + "---|" * (len(CAMERAS) + 1))

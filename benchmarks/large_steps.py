@@ -13,7 +13,6 @@ scene. A pose is right within 0.15 m and 4 degrees of the reference.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -22,12 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
 import sequences
 from scoring import roc_area
+from tofuse.engine.arrays import Float64
 from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import RangeFrame

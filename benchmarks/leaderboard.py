@@ -26,8 +26,6 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
 from boards import Board, Score
 from boards.graphs import Graphs
 from boards.sequences_board import Sequences

@@ -12,14 +12,12 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import os
-import platform
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from end_to_end import DATA, located, measured
+from end_to_end import add_options, located, measured, started
 
 TARGET = 25  # times faster
 
@@ -55,29 +53,13 @@ def ate(times: Sequence[float], poses: object, recording: object) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--input", default="kitchen", help="sequence, or path of a recording")
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the recorded sequences")
-    parser.add_argument("--start", type=int, default=0)
-    parser.add_argument("--end", type=int)
-    parser.add_argument("--every", type=int, default=1)
-    parser.add_argument("--threads", type=int, default=2)
+    add_options(parser)
     parser.add_argument("--fragment", type=int, default=100, help="frames per fragment of Open3D")
-    parser.add_argument("--no-first", action="store_true", help="count the first run as well")
     options = parser.parse_args(arguments)
     source = located(options.input, options.data)
     if not source.exists():
         parser.error(f"{source} does not exist")
-    if hasattr(os, "sched_setaffinity"):  # for both
-        cores = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, cores[: options.threads])
-    load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
-    chosen = ["--start", str(options.start), "--every", str(options.every)]
-    if options.end is not None:
-        chosen += ["--end", str(options.end)]
-    print(
-        f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}; "
-        f"{options.threads} threads{load}",
-        flush=True,
-    )
+    chosen = started(options)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "result"
         if not options.no_first:

@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import argparse
 import pickle
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,13 +32,11 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from tofuse.engine.arrays import Float32, Float64
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
 import tofuse
 from cloud_kinds import OBJECT_M, Pair, any_motion, scanner_rays
+from made_once import computed_once
 from tofuse.engine.alignment.base import Registration
+from tofuse.engine.arrays import Float32, Float64
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.geometry import se3
@@ -90,14 +87,9 @@ class Case:
 
 def cases(seed: int) -> list[Case]:
     """All pairs of one seed, simulated once."""
-    kept = OUT / f"{seed}.pickle"
-    if kept.exists():
-        made: list[Case] = pickle.loads(kept.read_bytes())
-        return made
-    made = [*_of_rooms(seed), *_of_objects(seed), *_of_scans(seed)]
-    OUT.mkdir(parents=True, exist_ok=True)
-    kept.write_bytes(pickle.dumps(made))
-    return made
+    return computed_once(
+        OUT / f"{seed}.pickle", lambda: [*_of_rooms(seed), *_of_objects(seed), *_of_scans(seed)]
+    )
 
 
 def _of_rooms(seed: int) -> Iterator[Case]:

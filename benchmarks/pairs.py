@@ -23,19 +23,14 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Unpack
 
 import numpy as np
-
-from tofuse.engine.arrays import Bool, Float64, Intp
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import sequences
 import tofuse
@@ -44,6 +39,7 @@ from peers import o3d_global
 from scoring import roc_area
 from sequences import DATA, kinect_loop
 from tofuse.engine.alignment.base import Registration
+from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.clouds.cloud_pair import register_clouds
 from tofuse.engine.clouds.pair import AnyPair
 from tofuse.engine.errors import RegistrationError
@@ -157,6 +153,19 @@ def chosen(count: int, gap: int, max_pairs: int) -> list[tuple[int, int]]:
     return [(int(i), int(i) + gap) for i in starts]
 
 
+def _pairs(
+    recording: Recording, gap: int, max_pairs: int
+) -> Iterator[tuple[RangeFrame, RangeFrame, Float64]]:
+    """Sources, targets and true poses of pairs with a gap."""
+    T = recording.reference
+    for i, j in chosen(len(recording), gap, max_pairs):
+        source, target = recording[j], recording[i]
+        assert isinstance(source, RangeFrame)
+        assert isinstance(target, RangeFrame)
+        if T is not None and np.isfinite(T[[i, j]]).all():
+            yield source, target, se3.inverse(T[i]) @ T[j]
+
+
 def pose_error(found: Float64, true: Float64) -> tuple[float, float]:
     """Error of a pose, m and degrees."""
     gap = se3.inverse(true) @ found
@@ -207,18 +216,9 @@ def print_table(names: Sequence[str], data: Path, max_pairs: int) -> None:
         if not _is_there(name, data):
             print(f"| {name}: no data |")
             continue
-        recording = opened(name, data)
         for gap in SCENES[name].gaps:
-            pairs = chosen(len(recording), gap, max_pairs)
             mine, theirs = [], []
-            for i, j in pairs:
-                source, target = recording[j], recording[i]
-                T = recording.reference
-                if not isinstance(source, RangeFrame) or not isinstance(target, RangeFrame):
-                    raise TypeError(f"{name} has clouds")
-                if T is None or not np.isfinite(T[[i, j]]).all():
-                    continue
-                true = se3.inverse(T[i]) @ T[j]
+            for source, target, true in _pairs(opened(name, data), gap, max_pairs):
                 if not ours:
                     tofuse.register(source, target)  # compiles
                 mine.append(outcome(tofuse.register, source, target, true))
@@ -267,16 +267,9 @@ def print_methods(names: Sequence[str], data: Path, max_pairs: int) -> None:
     for name in names:
         if not _is_there(name, data):
             continue
-        recording = opened(name, data)
         counts = np.zeros(len(WAYS) + 2, int)
         for gap in SCENES[name].gaps:
-            for i, j in chosen(len(recording), gap, max_pairs):
-                source, target, T = recording[j], recording[i], recording.reference
-                assert isinstance(source, RangeFrame)
-                assert isinstance(target, RangeFrame)
-                if T is None or not np.isfinite(T[[i, j]]).all():
-                    continue
-                true = se3.inverse(T[i]) @ T[j]
+            for source, target, true in _pairs(opened(name, data), gap, max_pairs):
                 made = {way: outcome(method, source, target, true) for way, method in WAYS.items()}
                 right = [o.right for o in made.values()]
                 counts += np.array([1, *right, any(right)])

@@ -17,7 +17,6 @@ import argparse
 import json
 import os
 import platform
-import sys
 import time
 from collections.abc import Iterator
 from collections.abc import Sequence as Items
@@ -27,12 +26,9 @@ from typing import Any
 
 import numpy as np
 
-from tofuse.engine.arrays import Float64
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
 import peers
 import sequences
+from tofuse.engine.arrays import Float64
 from tofuse.engine.compute.thread_pool import threads as using_threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
