@@ -288,22 +288,27 @@ def _resolve(
         return parts
     if not sniffs and len(children) == 1 and reading.is_folder(children[0]):
         return _resolve(children[0], format, options)
+    raise _refusal(path, sniffs, children)
+
+
+def _refusal(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> InputError:
+    """Why nothing is read at a path, by what is there."""
     suffixes = {p.suffix.lower() for p in (children or [path]) if p.is_file()}
     if suffixes and suffixes <= _ARCHIVES:
-        raise InputError(
+        return InputError(
             "is an archive, or contains only that",
             where=path,
             remedy="pass a .zip itself, unpack any other",
         )
     for suffix in suffixes & CLOSED.keys():
         problem, remedy = CLOSED[suffix]
-        raise InputError(problem, where=path, remedy=remedy)
-    exported = set[str]().union(*(kind for _, _, kind in _NO_DEPTH))
+        return InputError(problem, where=path, remedy=remedy)
     alone = not (sniffs or _folders_in(path) or _is_sure(path.absolute().parent))
+    exported = set[str]().union(*(kind for _, _, kind in _NO_DEPTH))
     if alone and suffixes and suffixes <= exported:
         problem, remedy = next((p, r) for p, r, kind in _NO_DEPTH if kind & suffixes)
-        raise InputError(problem, where=path, remedy=remedy)
-    raise _unidentified(path, sniffs, children)
+        return InputError(problem, where=path, remedy=remedy)
+    return _unidentified(path, sniffs, children)
 
 
 def _resolve_as(path: Path, format: str) -> list[_Located]:  # noqa: A002
