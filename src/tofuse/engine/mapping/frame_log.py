@@ -196,7 +196,8 @@ class FrameLog:
             remedy = "check it with `tofuse inspect`, and the limits of depth and the filters"
             depths = [e.record.mean_depth_m or 0.0 for e in entries]
             if np.nanmedian(depths) > _FAR_M:
-                remedy = f"depth must be in m; here it is {np.nanmedian(depths):.0f} m on average"
+                mean = f"{np.nanmedian(depths):.0f} m"
+                remedy = f"depth must be in m; here it is {mean} on average: use --factor"
             raise InputError(
                 f"has {quantities.count(len(entries), 'frame')}, none with enough valid points "
                 f"for a pose (first: {entries[0].record.reason})",
