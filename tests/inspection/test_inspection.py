@@ -253,6 +253,14 @@ FAULTS = {
 }
 
 
+def test_clock_that_was_set_has_not_lost_a_billion_frames() -> None:
+    times = np.arange(20) / 10 + 1.7e9 * (np.arange(20) > 7)
+    found = inspect_recording(of(stamped([image(2.0, k) for k in range(20)], times))).findings
+    (gap,) = (f for f in found if f.code == "frames_missing")
+    assert gap.text.startswith("The timestamps have 1 gap of up to 1.7e+09 s")
+    assert gap.remedy.startswith("Correct the times if a clock was set there")
+
+
 @pytest.mark.nightly_part
 def test_good_recording_has_no_findings(turn) -> None:
     assert codes(turn) == set()

@@ -242,6 +242,12 @@ def test_exports_without_depth_are_named(tmp_path: Path, names: list[str], says:
     (folder / "0.jpg").write_bytes(b"abc")
     with pytest.raises(InputError, match="pass the recording's folder"):
         open_recording(folder / "0.jpg")
+    # So do its images, of depth or not.
+    shutil.copytree(folder / "depth", folder / "amplitude")
+    (folder / "amplitude" / "notes.txt").touch()
+    for part in (folder / "depth", folder / "amplitude", folder / "amplitude" / "notes.txt"):
+        with pytest.raises(InputError, match=f"pass the recording's folder, {folder}(,|$)"):
+            open_recording(part)
     shutil.rmtree(folder)
     (tmp_path / "unknown").mkdir()
     with pytest.raises(InputError, match=r"known format: it contains .* folder"):

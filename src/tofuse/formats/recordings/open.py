@@ -301,7 +301,7 @@ def _resolve(
     if not sniffs and len(children) == 1 and reading.is_folder(children[0]):
         return _resolve(children[0], format, options)
     suffixes = {p.suffix.lower() for p in (children or [path]) if p.is_file()}
-    if suffixes and suffixes <= _ARCHIVES:
+    if suffixes and suffixes <= _ARCHIVES and not _folders_in(path):
         raise InputError(
             "is an archive, or contains only that",
             where=path,
@@ -393,9 +393,11 @@ def _recordings_in(path: Path, options: ReaderOptions) -> list[_Located]:
 
 
 def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> InputError:
+    whole = next((folder for folder in path.absolute().parents[:2] if _is_sure(folder)), None)
     if sniffs:
         evidence = "; ".join(dict.fromkeys(sniff.evidence for sniff in sniffs.values()))
-        remedies = [sniff.remedy or f"use --format {name}" for name, sniff in sniffs.items()]
+        remedies = [] if whole is None else [f"pass the recording's folder, {whole}"]
+        remedies += [sniff.remedy or f"use --format {name}" for name, sniff in sniffs.items()]
         return InputError(
             f"could not be identified: it has {evidence}",
             where=path,
@@ -421,9 +423,8 @@ def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) ->
         kind = f"a {path.suffix!r} file" if path.suffix else "a file without a suffix"
         problem = f"is not a recording of a known format, but {kind}"
         remedy = _REMEDIES.get(path.suffix.lower(), remedy)
-    folder = path.absolute().parent
-    if _is_sure(folder):
-        return InputError(problem, where=path, remedy=f"pass the recording's folder, {folder}")
+    if whole is not None:
+        return InputError(problem, where=path, remedy=f"pass the recording's folder, {whole}")
     return InputError(
         problem, where=path, remedy=f"{remedy}, or use --format ({', '.join(readers())})"
     )
