@@ -507,6 +507,26 @@ def test_head_of_xyz_is_skipped(tmp_path: Path, head: str) -> None:
     np.testing.assert_allclose(open_recording(tmp_path)[0].points, table[:, :3], rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "head",
+    ["# of a scanner\n//ID,X,Y,Z,Intensity,R,G,B\n20\n", "id;x[m];y[m];z[m];i;red;green;blue\n"],
+)
+def test_columns_of_xyz_that_are_named(tmp_path: Path, head: str) -> None:
+    points = np.random.default_rng(6).normal(size=(20, 3)).round(6)
+    table = np.c_[np.arange(20), points, np.arange(20) + 300, np.tile([10, 20, 30], (20, 1))]
+    rows = "".join(",".join(map(str, row)) + "\n" for row in table.tolist())
+    (tmp_path / "a.xyz").write_text(head + rows)
+    frame = open_recording(tmp_path)[0]
+    np.testing.assert_allclose(frame.points, points, rtol=1e-6)
+    np.testing.assert_array_equal(frame.amplitude, np.arange(20) + 300)
+    assert frame.color[0].tolist() == [10, 20, 30]
+    # A class is no amplitude, and the order is that of the file.
+    (tmp_path / "a.xyz").write_text("Y X Z Class\n1 2 3 4\n")
+    frame = open_recording(tmp_path)[0]
+    assert frame.amplitude is None
+    assert frame.points.tolist() == [[1, 2, 3]]
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz"])
 def test_map_coordinates_keep_millimetre_precision(tmp_path: Path, suffix: str) -> None:
     """Each cloud has its shift; poses stay those of the files."""

@@ -326,7 +326,9 @@ def _located_cloud(
     cloud = next((p for p in (result / "cloud.ply", result / "cloud.laz") if p.exists()), None)
     if cloud is None:
         raise InputError("has no cloud.ply", where=result, remedy="run `tofuse run` again")
-    pair = register_files(name, str(cloud), PairOptions(factor=options.factor, threads=options.threads), progress)
+    pair = register_files(
+        name, str(cloud), PairOptions(factor=options.factor, threads=options.threads), progress
+    )
     registration, C = pair.in_files, pair.registration.covariance
     location = locating.Location(
         registration.T_target_source,

@@ -393,7 +393,8 @@ def _recordings_in(path: Path, options: ReaderOptions) -> list[_Located]:
 
 
 def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> InputError:
-    whole = next((folder for folder in path.absolute().parents[:2] if _is_sure(folder)), None)
+    folder = path.absolute().parent
+    whole = folder if _is_sure(folder) else None
     if sniffs:
         evidence = "; ".join(dict.fromkeys(sniff.evidence for sniff in sniffs.values()))
         remedies = [] if whole is None else [f"pass the recording's folder, {whole}"]
