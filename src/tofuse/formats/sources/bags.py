@@ -465,8 +465,9 @@ FITS = 2
 
 def info_rank(message: Any, where: str, size: tuple[int, int] | None) -> int:
     """Return `FITS` for a lens of images of a size, 1 for another lens, 0 for zeros in its place."""
-    info = camera_info(message, where)
-    return 0 if info.values["fx"] == 0 else FITS if size in (None, *_sizes(message)) else 1
+    if camera_info(message, where).values["fx"] == 0:
+        return 0
+    return FITS if size in (None, *_sizes(message)) else 1
 
 
 def _sizes(message: Any) -> tuple[tuple[int, int], tuple[int, int]]:
