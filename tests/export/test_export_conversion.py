@@ -127,7 +127,7 @@ def test_correction_is_kept_with_raw_measurements(tmp_path: Path) -> None:
 @pytest.mark.parametrize("up", [np.array([0.0, 0.6, 0.8]), None])
 def test_clouds_in_map_coordinates(tmp_path: Path, up) -> None:
     """Each has its own shift; which way is up is of the format."""
-    places = np.array([500_000.123, 4_000_000.456, 3]) + [[0, 0, 0], [9, 2, 1]]
+    places = np.array([[500_000.123, 4_000_000.456, 3], [500_009.1, 4_000_002.4, 4]])
     points = [place + np.random.default_rng(3).uniform(-3, 3, (40, 3)) for place in places]
     frames = [CloudFrame.of(p, index=k, timestamp=float(k), up=up) for k, p in enumerate(points)]
     result = convert(Recording.of(ArraySource(frames), "scans", "las"), tmp_path / "out")

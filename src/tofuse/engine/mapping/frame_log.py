@@ -68,17 +68,17 @@ class FrameSequence:
             return
         problem = ""
         if self._times and frame.timestamp <= self._times[-1]:
-            problem = f"is {frame.timestamp:.10g}, after {self._times[-1]:.10g}"
+            problem = f" is {frame.timestamp:.10g}, after {self._times[-1]:.10g}"
         self._times = [*self._times[-_TIMES:], frame.timestamp]
         try:
             if not problem and len(self._times) > 1:
                 check_seconds(np.array(self._times))
         except InputError as error:
-            problem = error.problem
+            problem = f"s {error.problem}"
         if problem:
             self._times = None
             warnings.warn(
-                f"frame {frame.index}: timestamp {problem}; motion is predicted by times: pass "
+                f"frame {frame.index}: timestamp{problem}; motion is predicted by times: pass "
                 "seconds that ascend, and leave out frames that repeat",
                 InputWarning,
                 stacklevel=4,

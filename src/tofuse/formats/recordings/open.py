@@ -166,8 +166,8 @@ def open_recording(
     if rig is not None:
         cameras = _rig_source(Path(rig), inner, format, options)
         if (min_depth, max_depth, factor) != (None, None, None):
-            names = "min_depth, max_depth, factor"
-            raise InputError("do not apply to a rig", where=names, remedy="leave them out")
+            given = "min_depth, max_depth, factor"
+            raise InputError("do not apply to a rig", where=given, remedy="leave them out")
         return Recording.of(cameras, shown_path, "rig", again)
     for path in inner:
         _check_kind(path)
@@ -182,8 +182,7 @@ def open_recording(
     if len(inner) == 1:
         _read_noise(source, inner[0])
     if factor is not None:
-        is_cloud = isinstance(first_frame, CloudFrame)
-        source = ScaledSource(source, factor, poses=is_cloud)
+        source = ScaledSource(source, factor, poses=isinstance(first_frame, CloudFrame))
     if min_depth is not None or max_depth is not None:
         source = LimitedSource(
             source, min_depth or 0.0, float("inf") if max_depth is None else max_depth

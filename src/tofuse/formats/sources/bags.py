@@ -464,7 +464,7 @@ FITS = 2
 
 
 def info_rank(message: Any, where: str, size: tuple[int, int] | None) -> int:
-    """Return `FITS` for a lens of images of a size, 1 for another lens, 0 for zeros in its place."""
+    """Return `FITS` for the lens of images of a size, 1 for another lens, 0 for zeros."""
     if camera_info(message, where).values["fx"] == 0:
         return 0
     return FITS if size in (None, *_sizes(message)) else 1
