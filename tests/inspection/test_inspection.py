@@ -143,6 +143,12 @@ def test_unreadable_frames_give_warning(copy) -> None:
     assert len(found.warnings) == 1
     assert "000002.png" in found.warnings[0]
     assert found.facts["frames"] == "8"
+    # One line for all that have the same fault.
+    for k in (3, 5):
+        (copy / f"depth/{k:06d}.png").write_bytes(b"")
+    (warning,) = inspect_recording(tofuse.open(copy)).warnings
+    assert "000002.png" in warning
+    assert warning.endswith("(2 more sampled frames are alike)")
 
 
 def test_warnings_of_the_reader_are_reported(tmp_path, capsys) -> None:
