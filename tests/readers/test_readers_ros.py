@@ -682,6 +682,17 @@ def test_accelerometer_apart_from_depth_is_named(tmp_path: Path) -> None:
     assert any("gravity in /imu is ignored: the relation" in line for line in recording.warnings)
 
 
+def test_tf_of_another_clock_is_named(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "mcap")
+    bag.info("/a/depth/camera_info")
+    for k in range(3):
+        bag.image("/a/depth/image", 10 + k / 10, COUNTS[k], "16UC1")
+        bag.tf("/tf", 1e9 + k / 10, "odom", "depth", exp([k, 0, 0, 0, 0, 0]))
+    recording = open_recording(bag.close())
+    assert recording.odometry is None
+    assert any("moves, but at no time of an image" in line for line in recording.warnings)
+
+
 def test_tf_without_the_frame_of_depth(tmp_path: Path) -> None:
     """The latched /tf_static is missing: the robot moves, and nothing says where the camera is."""
     bag = Bag(tmp_path, "mcap")

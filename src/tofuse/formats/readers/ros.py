@@ -265,6 +265,12 @@ class RosSource(bags.BagSource):
             poses = transforms.poses(ancestors[-1], frame, self.timestamps)
             if np.isfinite(poses).any():
                 self.reference = poses
+        moves = transforms.moves(ancestors[-1], frame)
+        if moves and self.reference is None and self.odometry is None:
+            self.warnings.append(
+                f"tf or odometry states how the frame of depth, {frame!r}, moves, but at no time "
+                "of an image: is their clock another one?"
+            )
 
     def _read_gravity(self, transforms: bags.Transforms) -> None:
         """Read the direction of gravity from an accelerometer that is fixed to the camera."""
