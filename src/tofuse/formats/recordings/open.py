@@ -159,7 +159,7 @@ def open_recording(
     )
     shown_path = " ".join(map(str, paths))
     inner = [unzipped(path) for path in paths]
-    options = ReaderOptions(None if camera is None else Path(camera), topic)
+    options = ReaderOptions(None if camera is None else Path(camera), topic, factor)
     in_folder = rig_file_in(inner[0]) if rig is None and len(inner) == 1 else None
     if in_folder is not None:
         rig, inner = in_folder, list(recordings_of(in_folder).values())
