@@ -279,7 +279,11 @@ def test_limits_of_depth(tmp_path: Path) -> None:
 
 def test_factor_of_images_is_that_of_depth(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", [1, 2, 3])
+    (folder / "frames.csv").write_text("temperature_c\n20\n21\n22\n")
     recording = Opening((folder,), factor=0.5).open()
+    converted = open_recording(convert(recording, tmp_path / "b").folder)
+    assert depths(converted) == [0.5, 1.0, 1.5]
+    assert converted.source.frame_columns["temperature_c"].tolist() == [20, 21, 22]
     assert depths(recording) == [0.5, 1.0, 1.5]
     assert recording.metadata["depth_unit_m"] == open_recording(folder).metadata["depth_unit_m"] / 2
     assert [len(f) for f in open_recording(folder, factor=0.5, max_depth=1.2)] == [1200, 1200, 0]

@@ -117,6 +117,8 @@ class _DerivedSource:
         self.odometry = source.odometry
         self.gravity = source.gravity
         self.metadata = source.metadata
+        for name in ("imu", "frame_columns"):  # which conversion keeps
+            setattr(self, name, getattr(source, name, None))
 
     @property
     def warnings(self) -> list[str]:
@@ -141,9 +143,9 @@ class ScaledSource(_DerivedSource):
     def __init__(self, source: Source, factor: float, *, poses: bool) -> None:
         super().__init__(source)
         self.factor = factor
-        if "depth_unit_m" in source.metadata:
-            unit_m = factor * source.metadata["depth_unit_m"]
-            self.metadata = source.metadata | {"depth_unit_m": unit_m}
+        units = {name: source.metadata.get(name) for name in ("depth_unit_m", "sigma_unit_m")}
+        scaled = {name: factor * unit_m for name, unit_m in units.items() if unit_m is not None}
+        self.metadata = source.metadata | scaled
         if poses:
             scale = np.ones((4, 4))
             scale[:3, 3] = factor
