@@ -18,7 +18,7 @@ from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
-from tofuse.engine.frames.recording import POSES_BY, Recording
+from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording
 from tofuse.engine.noise import NOISE
 from tofuse.engine.noise.model import family_of
 from tofuse.formats.cameras import read_noise, write_noise
@@ -122,6 +122,21 @@ def test_correction_is_kept_with_raw_measurements(tmp_path: Path) -> None:
     # The given recording still applies its correction.
     assert isinstance(before.source, NativeSource)
     assert before.source.correction is not None
+
+
+@pytest.mark.parametrize("up", [np.array([0.0, 0.6, 0.8]), None])
+def test_clouds_in_map_coordinates(tmp_path: Path, up) -> None:
+    """Each has its own shift; which way is up is of the format."""
+    places = np.array([[500_000.123, 4_000_000.456, 3], [500_009.1, 4_000_002.4, 4]])
+    points = [place + np.random.default_rng(3).uniform(-3, 3, (40, 3)) for place in places]
+    frames = [CloudFrame.of(p, index=k, timestamp=float(k), up=up) for k, p in enumerate(points)]
+    result = convert(Recording.of(ArraySource(frames), "scans", "las"), tmp_path / "out")
+    assert not result.warnings
+    for frame, expected in zip(open_recording(tmp_path / "out"), points, strict=True):
+        np.testing.assert_allclose(frame.points + frame.shift, expected, atol=1e-3)
+        assert (frame.up is None) == (up is None)
+        if up is not None:
+            np.testing.assert_allclose(frame.up, up, atol=1e-9)
 
 
 def test_clouds(tmp_path: Path) -> None:

@@ -143,6 +143,12 @@ def test_unreadable_frames_give_warning(copy) -> None:
     assert len(found.warnings) == 1
     assert "000002.png" in found.warnings[0]
     assert found.facts["frames"] == "8"
+    # One line for all that have the same fault.
+    for k in (3, 5):
+        (copy / f"depth/{k:06d}.png").write_bytes(b"")
+    (warning,) = inspect_recording(tofuse.open(copy)).warnings
+    assert "000002.png" in warning
+    assert warning.endswith("(2 more sampled frames are alike)")
 
 
 def test_warnings_of_the_reader_are_reported(tmp_path, capsys) -> None:
@@ -251,6 +257,14 @@ FAULTS = {
     "flying_pixels": lambda f: [replace(a, depth=cv2.GaussianBlur(a.depth, (0, 0), 2)) for a in f],
     "few_valid": lambda f: [a.keep(np.arange(96 * 72).reshape(72, 96) % 15 == 0) for a in f],
 }
+
+
+def test_clock_that_was_set_has_not_lost_a_billion_frames() -> None:
+    times = np.arange(20) / 10 + 1.7e9 * (np.arange(20) > 7)
+    found = inspect_recording(of(stamped([image(2.0, k) for k in range(20)], times))).findings
+    (gap,) = (f for f in found if f.code == "frames_missing")
+    assert gap.text.startswith("The timestamps have 1 gap of up to 1.7e+09 s")
+    assert gap.remedy.startswith("Correct the times if a clock was set there")
 
 
 @pytest.mark.nightly_part

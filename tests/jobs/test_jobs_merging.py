@@ -201,6 +201,13 @@ def test_bad_input_is_refused_in_one_line(session_results, tmp_path) -> None:
     refused([here, tmp_path], "no run.json")
     copied(here, tmp_path)
     refused([here, tmp_path / "out"], "same recording", f"{N} frames are in both")
+    # Of a copy of the recording, too.
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    (path,) = run["input"]["opening"]["paths"]
+    shutil.copytree(path, tmp_path / "copy")
+    run["input"]["opening"]["paths"] = [str(tmp_path / "copy")]
+    change_run(tmp_path / "out", input=run["input"])
+    refused([here, tmp_path / "out"], "same recording", f"{N} frames are in both")
 
 
 def test_missing_recording_is_named_with_remedy(session_results, tmp_path) -> None:

@@ -149,3 +149,17 @@ def test_largest_number_is_no_depth(tmp_path: Path, kind: str, order: str) -> No
         assert isinstance(frame, RangeFrame)
         assert (frame.depth[0, 0], frame.valid.sum()) == (0, 23)
         assert frame.depth.dtype == np.float32
+
+
+def test_arrays_that_hold_no_depth_in_mm_or_are_elsewhere() -> None:
+    """8 bits end at 255 mm; tensors on a GPU say themselves what to do."""
+    K = [[50.0, 0, 31.5], [0, 50.0, 23.5], [0, 0, 1]]
+    with pytest.raises(InputError, match="uint8, which ends at 255 mm; pass images of 16 bits, or"):
+        tofuse.from_arrays(np.ones((3, 48, 64), np.uint8), K)
+
+    class Tensor:
+        def __iter__(self):
+            raise TypeError("can't convert cuda:0 device type tensor to numpy: use Tensor.cpu()")
+
+    with pytest.raises(InputError, match=r"not an array of images .*use Tensor\.cpu\(\)"):
+        tofuse.from_arrays(Tensor(), K)

@@ -507,6 +507,41 @@ def test_head_of_xyz_is_skipped(tmp_path: Path, head: str) -> None:
     np.testing.assert_allclose(open_recording(tmp_path)[0].points, table[:, :3], rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "head",
+    ["# of a scanner\n//ID,X,Y,Z,Intensity,R,G,B\n20\n", "id;x[m];y[m];z[m];i;red;green;blue\n"],
+)
+def test_columns_of_xyz_that_are_named(tmp_path: Path, head: str) -> None:
+    points = np.random.default_rng(6).normal(size=(20, 3)).round(6)
+    table = np.c_[np.arange(20), points, np.arange(20) + 300, np.tile([10, 20, 30], (20, 1))]
+    rows = "".join(",".join(map(str, row)) + "\n" for row in table.tolist())
+    (tmp_path / "a.xyz").write_text(head + rows)
+    frame = open_recording(tmp_path)[0]
+    np.testing.assert_allclose(frame.points, points, rtol=1e-6)
+    np.testing.assert_array_equal(frame.amplitude, np.arange(20) + 300)
+    assert frame.color[0].tolist() == [10, 20, 30]
+    # A class is no amplitude, and the order is that of the file.
+    (tmp_path / "a.xyz").write_text("Y X Z Class\n1 2 3 4\n")
+    frame = open_recording(tmp_path)[0]
+    assert frame.amplitude is None
+    assert frame.points.tolist() == [[1, 2, 3]]
+
+
+def test_map_coordinates_that_floats_round_are_refused(tmp_path: Path) -> None:
+    """In a room they would be steps of half a metre; over a town the same steps don't matter."""
+    scan = np.random.default_rng(5).uniform(-3, 3, (40, 3))
+    for factor, place in ((1, [5e5, 5e6, 3]), (1, [5e4, 9e3, 3]), (1000, [5e5, 5e6, 3])):
+        points = factor * scan + np.array(place)
+        write_ply(tmp_path / "a.ply", GeometryRecord(points.astype(np.float32)))
+        if place[1] == 5e6 and factor == 1:
+            with pytest.raises(InputError, match=r"a.ply: .* 32-bit floats round to 0.5 m"):
+                open_recording(tmp_path)
+            with pytest.raises(InputError, match="double precision"):
+                CloudFrame.of(points.astype(np.float32))
+        else:
+            assert len(open_recording(tmp_path)[0]) == 40
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".xyz"])
 def test_map_coordinates_keep_millimetre_precision(tmp_path: Path, suffix: str) -> None:
     """Each cloud has its shift; poses stay those of the files."""

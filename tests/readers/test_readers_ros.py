@@ -26,6 +26,7 @@ from ros_bags import (
     T_DEPTH,
     TOPIC,
     Bag,
+    jpeg_bytes,
     orbbec,
     real_sense,
 )
@@ -171,6 +172,48 @@ def test_compressed_depth(tmp_path: Path) -> None:
     second.compressed(topic, 10, data, "32FC1; compressedDepth png")
     frame = open_recording(second.close())[0]
     np.testing.assert_allclose(frame.z, a / (COUNTS[1] - b), rtol=1e-5)
+
+
+def test_depth_compressed_as_any_image(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros2")
+    bag.info("/a/depth/camera_info")
+    color = jpeg_bytes(np.zeros((12, 16, 3), np.uint8))
+    bag.compressed("/a/color_to_depth/compressed", 10, color, "rgb8; jpeg compressed bgr8")
+    topic = "/a/depth/image/compressed"
+    bag.compressed(topic, 10, png_bytes(COUNTS[0]), "16UC1; png compressed ")
+    recording = open_recording(bag.close())
+    assert recording.metadata["topic"] == topic
+    assert not [line for line in recording.warnings if "is read; others are" in line]
+    np.testing.assert_allclose(recording[0].z, COUNTS[0] / 1000, rtol=1e-6)
+
+
+def test_lens_and_size_once_the_driver_has_settled(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "mcap")
+    topic = f"{TOPIC.rpartition('/')[0]}/camera_info"
+    unknown = SimpleNamespace(width=16, height=12, fx=0, fy=0, cx=0, cy=0)
+    coarse = Pinhole(8, 6, 10.0, 10.5, 3.5, 2.5)
+    for lens in (unknown, coarse, DEPTH_LENS):
+        bag.info(topic, D=(), lens=lens)
+    for k in range(4):
+        counts = COUNTS[0][::2, ::2] if k == 0 else COUNTS[0]
+        bag.image(TOPIC, 10 + k / 10, np.ascontiguousarray(counts), "16UC1")
+    recording = open_recording(bag.close())
+    assert [frame.camera for frame in recording.readable(4)] == [DEPTH_LENS] * 3
+
+
+def test_lens_of_another_namespace_by_frame_and_size(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "ros1")
+    for topic, lens in (("/a/info", COLOR_LENS), ("/b/info", DEPTH_LENS)):
+        bag.info(topic, D=(), lens=lens)
+    bag.image("/driver/tof/depth", 10, COUNTS[0], "16UC1")
+    assert open_recording(bag.close())[0].camera == DEPTH_LENS
+    (tmp_path / "b").mkdir()
+    bag = Bag(tmp_path / "b", "ros1")
+    for topic in ("/a/info", "/b/info"):
+        bag.info(topic, D=(), lens=COLOR_LENS)
+    bag.image("/driver/tof/depth", 10, COUNTS[0], "16UC1")
+    with pytest.raises(InputError, match=r"no CameraInfo for .*, but for others \(/a/info, /b/i"):
+        open_recording(bag.close())
 
 
 def test_clouds(tmp_path: Path) -> None:
@@ -637,6 +680,17 @@ def test_accelerometer_apart_from_depth_is_named(tmp_path: Path) -> None:
     recording = open_recording(bag.close())
     assert recording.gravity is None
     assert any("gravity in /imu is ignored: the relation" in line for line in recording.warnings)
+
+
+def test_tf_of_another_clock_is_named(tmp_path: Path) -> None:
+    bag = Bag(tmp_path, "mcap")
+    bag.info("/a/depth/camera_info")
+    for k in range(3):
+        bag.image("/a/depth/image", 10 + k / 10, COUNTS[k], "16UC1")
+        bag.tf("/tf", 1e9 + k / 10, "odom", "depth", exp([k, 0, 0, 0, 0, 0]))
+    recording = open_recording(bag.close())
+    assert recording.odometry is None
+    assert any("moves, but at no time of an image" in line for line in recording.warnings)
 
 
 def test_tf_without_the_frame_of_depth(tmp_path: Path) -> None:

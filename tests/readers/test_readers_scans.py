@@ -174,6 +174,12 @@ def test_las_in_feet_is_refused(tmp_path: Path, kind: str) -> None:
         else:
             with pytest.raises(InputError, match=r"a\.las: has coordinates in feet; convert"):
                 tofuse.open(tmp_path / "a.las")
+            with pytest.raises(
+                InputError, match=r"to m by factor 0\.3048006096 \(`tofuse convert`\)"
+            ):
+                tofuse.open(tmp_path / "a.las")
+            frame = tofuse.open(tmp_path / "a.las", factor=0.3048006096)[0]
+            np.testing.assert_allclose(frame.points, 0.3048006096 * POINTS, atol=0.01)
 
 
 def test_las_with_excessive_point_count(tmp_path: Path) -> None:

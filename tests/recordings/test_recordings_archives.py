@@ -67,6 +67,26 @@ def test_archive_that_is_not_unpacked_is_named_so(tmp_path: Path) -> None:
             open_recording(tmp_path / name)
 
 
+def test_archive_in_an_archive(tmp_path: Path) -> None:
+    made.make_scanner_app(tmp_path / "scan")
+    inner = zipped(tmp_path / "scan", tmp_path / "scan.zip", "scan")
+    for name in ("once.zip", "twice.zip"):
+        with zipfile.ZipFile(tmp_path / name, "w") as archive:
+            archive.write(inner, inner.name)
+        inner = tmp_path / name
+    assert len(open_recording(tmp_path / "once.zip")) == 3
+    # One that contains itself would never end.
+    with pytest.raises(InputError, match=r"^\S*twice.zip/\S*: is an archive"):
+        open_recording(tmp_path / "twice.zip")
+
+
+def test_archive_beside_a_folder_is_not_all_there_is(tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    (tmp_path / "scan.zip").touch()
+    with pytest.raises(InputError, match=r"it contains 1 \S+, 1 \S+"):
+        open_recording(tmp_path)
+
+
 def test_archive_of_single_file_is_that_file(tmp_path: Path) -> None:
     pytest.importorskip("lzfse")
     made.make_r3d(tmp_path / "scan.r3d")

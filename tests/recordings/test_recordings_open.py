@@ -19,6 +19,7 @@ from tofuse.engine.errors import InputError, UnreadableFrameError, on_command_li
 from tofuse.engine.frames.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.fusion.geometry_record import GeometryRecord
+from tofuse.engine.geometry import se3
 from tofuse.engine.noise import NOISE, noise_model_for
 from tofuse.formats.cameras import write_noise
 from tofuse.formats.export.conversion import convert
@@ -26,7 +27,7 @@ from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.images import write_png
 from tofuse.formats.recordings.joined import JoinedSource
 from tofuse.formats.recordings.native import RecordingWriter
-from tofuse.formats.recordings.open import open_recording, readers
+from tofuse.formats.recordings.open import Opening, open_recording, open_view, readers
 
 CAMERA = Pinhole(40, 30, 35.0, 36.0, 19.5, 14.5)
 
@@ -241,6 +242,11 @@ def test_exports_without_depth_are_named(tmp_path: Path, names: list[str], says:
     (folder / "0.jpg").write_bytes(b"abc")
     with pytest.raises(InputError, match="pass the recording's folder"):
         open_recording(folder / "0.jpg")
+    # So do its images, of depth or not.
+    shutil.copytree(folder / "depth", folder / "amplitude")
+    for part in (folder / "depth", folder / "amplitude"):
+        with pytest.raises(InputError, match=f"pass the recording's folder, {folder}(,|$)"):
+            open_recording(part)
     shutil.rmtree(folder)
     (tmp_path / "unknown").mkdir()
     with pytest.raises(InputError, match=r"known format: it contains .* folder"):
@@ -269,6 +275,38 @@ def test_limits_of_depth(tmp_path: Path) -> None:
             open_recording(folder, **limits)
     with pytest.raises(InputError, match="smaller one first"):
         open_recording(folder, min_depth=2.0, max_depth=1.0)
+
+
+def test_factor_of_images_is_that_of_depth(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a", [1, 2, 3])
+    (folder / "frames.csv").write_text("temperature_c\n20\n21\n22\n")
+    recording = Opening((folder,), factor=0.5).open()
+    converted = open_recording(convert(recording, tmp_path / "b").folder)
+    assert depths(converted) == [0.5, 1.0, 1.5]
+    assert converted.source.frame_columns["temperature_c"].tolist() == [20, 21, 22]
+    assert depths(recording) == [0.5, 1.0, 1.5]
+    assert recording.metadata["depth_unit_m"] == open_recording(folder).metadata["depth_unit_m"] / 2
+    assert [len(f) for f in open_recording(folder, factor=0.5, max_depth=1.2)] == [1200, 1200, 0]
+    for factor in (0.0, -1.0, float("nan"), "mm"):
+        with pytest.raises(InputError, match="factor"):
+            open_recording(folder, factor=factor)
+
+
+def test_factor_of_clouds_is_that_of_all_lengths(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3)) + np.array([9, 0, 0])
+    for k in range(2):
+        np.savetxt(tmp_path / f"{k}.xyz", 1000 * points)
+    (tmp_path / "groundtruth.txt").write_text("0 0 0 0 0 0 0 1\n1 1000 0 0 0 0 0 1\n")
+    recording = open_recording(tmp_path, factor=0.001)
+    # In mm their coordinates are as large as those of a map, in m they are not.
+    assert open_recording(tmp_path)[0].shift.any()
+    assert not recording[0].shift.any()
+    np.testing.assert_allclose(recording[1].points, points, atol=1e-4)
+    np.testing.assert_allclose(recording.reference[1], se3.translation([1, 0, 0]))
+    opening = Opening((tmp_path,), factor=0.001)
+    assert Opening.from_dict(opening.to_dict(), tmp_path).factor == 0.001
+    view = open_view(f"{tmp_path}#1", factor=0.001)
+    np.testing.assert_allclose(view.frame.points, points, atol=1e-4)
 
 
 def test_result_is_no_recording(tmp_path: Path) -> None:

@@ -349,6 +349,12 @@ def test_small_motion_is_not_standing_still() -> None:
         assert codes(evidence(steps=steps)) == []
 
 
+def test_clouds_in_one_frame_are_of_no_camera_that_stood_still() -> None:
+    _, reasons = judge(replace(CASES["stood_still"], scans=True))
+    (still,) = (r for r in reasons if r.code == "stood_still")
+    assert still.text.startswith("The 9 clouds fit as they are")
+
+
 def test_images_without_overlap_give_no_evidence() -> None:
     assert codes(evidence(images=CrossViewConsistency(tuple(range(5)), ()))) == []
     assert codes(replace(evidence(), cross_view=None)) == []

@@ -43,7 +43,8 @@ def shown(text: str) -> str:
 
 
 def _without_temporary(text: str) -> str:
-    for folder, path in list(SHOWN_AS.items()):  # another thread may add one
+    # The last first, which may be in an earlier one; another thread may add one.
+    for folder, path in reversed(list(SHOWN_AS.items())):
         text = text.replace(folder, path)
     return text
 

@@ -14,6 +14,7 @@ from typing import Any, Literal
 from tofuse.apps.cli.values import (
     Count,
     Depth,
+    Factor,
     Length,
     Metres,
     NonNegative,
@@ -132,7 +133,20 @@ class Source(Command):
     topic: str | None = None
 
 
-class Selection(Source):
+class Scaled(Source):
+    """How recordings in another unit are opened.
+
+    Input
+    -----
+    factor : F
+        multiply the depth of images, or the points and poses of clouds, by F, such as 0.001 for mm
+        read as m
+    """
+
+    factor: Factor | None = None
+
+
+class Selection(Scaled):
     """Which frames are read.
 
     Input
@@ -359,7 +373,7 @@ class Register(Written, Json, Threads, Source):
     guess: Path | None = None
     method: str | None = None
     scale: bool = False
-    factor: float | None = None
+    factor: Factor | None = None
     risk: float = 0.1
 
 
@@ -750,7 +764,7 @@ class Plan(Json, Seed, Threads, Edited):
     tolerance: Length = 0.005
 
 
-class Inspect(Json, Source):
+class Inspect(Json, Scaled):
     """Show a recording's properties and check it for faults.
 
     Attributes
@@ -870,7 +884,7 @@ class Calibrate(Json, Seed, Selection):
     recording: str | None = None
 
 
-class Noise(Json, Source):
+class Noise(Json, Scaled):
     """Estimate a camera's noise from a static recording.
 
     Attributes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -34,6 +35,7 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, *args: Any, command: type[Command] | None = None, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._without_options = command
+        self._words: list[str] = []
 
     def add_options(self) -> None:
         """Add the options of the command, once."""
@@ -44,10 +46,16 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse what belongs to this command."""
         self.add_options()
+        self._words = list(args or ())
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """Print one line and exit with 2."""
+        """Print one line and exit with 2; what is missing may be written as an unknown option."""
+        options = (w for w in self._words if re.match("--?[a-z]", w) and " " not in w)
+        known = self._option_string_actions
+        unknown = next((w for w in options if w.partition("=")[0] not in known), None)
+        if unknown is not None and "are required" in message:
+            message = self._unknown(unknown)
         sys.stderr.write(f"{self.prog}: {message}; see `{self.prog} --help`\n")
         sys.exit(2)
 
@@ -61,10 +69,12 @@ class Parser(argparse.ArgumentParser):
             sys.exit(0)
         if unknown:
             command: Parser = getattr(arguments, "parser", self)
-            word = unknown[0].partition("=")[0]
-            hint = _suggestion(word, command._option_string_actions)
-            command.error(f"unknown option {word}{hint}")
+            command.error(command._unknown(unknown[0]))
         return arguments
+
+    def _unknown(self, word: str) -> str:
+        option = word.partition("=")[0]
+        return f"unknown option {option}{_suggestion(option, self._option_string_actions)}"
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is not None and value not in action.choices:
@@ -72,6 +82,8 @@ class Parser(argparse.ArgumentParser):
             name = action.metavar or "/".join(action.option_strings) or action.dest
             kind = "unknown command" if name == "COMMAND" else f"{name}: unknown value"
             hint = _suggestion(str(value), choices) or f" (one of {', '.join(choices)})"
+            if name == "COMMAND" and os.path.exists(value):
+                hint = f", but a path: `tofuse inspect {value}`, `tofuse run {value} --out result`"
             raise argparse.ArgumentError(None, f"{kind} {value!r}{hint}")
 
 

@@ -97,4 +97,6 @@ Seconds = Annotated[float, Bounds(0, exclusive=True)]
 Metres = Annotated[float, Bounds(0)]
 Depth = Annotated[float, _depth]
 Length = Annotated[float, _length]
+# As `tofuse.formats.recordings.FACTORS`, which would load NumPy.
+Factor = Annotated[float, Bounds(1e-6, 1e6)]
 Size = Annotated[int, _size]

@@ -127,7 +127,7 @@ def inspect_recording(
         recording = open_recording(recording)
     check_one_camera(recording)
     sample = Sample.of(recording, QUICK_PAIRS if quick else PAIRS, turning=turning)
-    notes = [*recording.warnings, *(str(error) for error in sample.unreadable)]
+    notes = [*recording.warnings, *_unreadable(sample)]
     if not sample.frames:
         raise InputError("no frame can be read", where=recording.path, remedy=notes[-1])
     # BLAS results depend on its number of threads.
@@ -135,6 +135,17 @@ def inspect_recording(
         findings = [f for check in CHECKS for f in check(sample)]
     findings.sort(key=lambda f: SEVERITIES.index(f.severity))
     return Inspection(recording, tuple(findings), tuple(notes), sample.frames)
+
+
+def _unreadable(sample: Sample) -> list[str]:
+    """The errors of unreadable frames, each once."""
+    alike: dict[tuple[str, str | None], list[str]] = {}
+    for error in sample.unreadable:
+        alike.setdefault((error.problem, error.remedy), []).append(str(error))
+    return [
+        lines[0] + (f" ({len(lines) - 1} more sampled frames are alike)" if lines[1:] else "")
+        for lines in alike.values()
+    ]
 
 
 def _facts(recording: Recording, frames: Sequence[Frame]) -> dict[str, str]:

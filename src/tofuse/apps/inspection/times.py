@@ -65,12 +65,16 @@ def check_times(sample: Sample) -> Iterator[Finding]:
     missing = int(np.round(gaps / interval).sum()) - len(gaps)
     if _is_regular(forward, interval) and missing > _MAX_MISSING_FRACTION * len(times):
         are = " is" if missing == 1 else "s are"
+        begin = f"About {missing} frame{are} missing: the"
+        remedy = "Record to a faster disk, or at a lower rate; tracking may fail at the gaps."
+        if missing > len(times):  # recorders rarely lose as many
+            begin = "The"
+            remedy = "Correct the times if a clock was set there; tracking may fail at the gaps."
         yield Finding(
             "frames_missing",
-            f"About {missing} frame{are} missing: the timestamps have {len(gaps)} "
-            f"gap{'s' if len(gaps) > 1 else ''} of up to {gaps.max():.3g} s; the median "
-            f"interval is {interval:.3g} s.",
-            "Record to a faster disk, or at a lower rate; tracking may fail at the gaps.",
+            f"{begin} timestamps have {len(gaps)} gap{'s' if len(gaps) > 1 else ''} of up to "
+            f"{gaps.max():.3g} s; the median interval is {interval:.3g} s.",
+            remedy,
             {"missing": missing, "gaps": len(gaps), "largest_s": float(gaps.max())},
         )
 

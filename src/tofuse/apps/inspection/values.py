@@ -95,11 +95,17 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
         return
     # The power of ten by which the distance is nearest to 2 m.
     factor = float(10.0 ** np.round(np.log10(median / 2.0)))
-    remedy = f"Check depth_unit_m: it may be wrong by a factor of {factor:g}."
+    correction = f"--factor {1 / factor:g}"
+    remedy = (
+        f"Check depth_unit_m: it may be wrong by a factor of {factor:g}; {correction} corrects it."
+    )
     if factor == 1:
         remedy = "Check ambiguity_m: it is the range of one phase period."
     if not sample.images:
-        remedy = f"Coordinates are read as metres: multiply those in the files by {1 / factor:g}."
+        remedy = (
+            f"Coordinates are read as metres: multiply those in the files by {1 / factor:g}, as "
+            f"{correction} does."
+        )
     yield Finding(
         "depth_unit",
         f"The median depth is {median:.3g} m, {problem}.",

@@ -300,7 +300,13 @@ def _located_in(
             "names one frame already", where=name, remedy="leave out --start, --end and --every"
         )
     else:
-        view = open_view(name, format=options.format, camera=options.camera, topic=options.topic)
+        view = open_view(
+            name,
+            format=options.format,
+            camera=options.camera,
+            topic=options.topic,
+            factor=options.factor,
+        )
         frame, recording, is_clip = view.frame, view.recording, False
     if frame is not None and kind_of(frame) == "cloud":
         return [_located_cloud(result, name, options, progress)]
@@ -320,7 +326,9 @@ def _located_cloud(
     cloud = next((p for p in (result / "cloud.ply", result / "cloud.laz") if p.exists()), None)
     if cloud is None:
         raise InputError("has no cloud.ply", where=result, remedy="run `tofuse run` again")
-    pair = register_files(name, str(cloud), PairOptions(threads=options.threads), progress)
+    pair = register_files(
+        name, str(cloud), PairOptions(factor=options.factor, threads=options.threads), progress
+    )
     registration, C = pair.in_files, pair.registration.covariance
     location = locating.Location(
         registration.T_target_source,

@@ -40,6 +40,8 @@ class Session:
     stated
         By the index of a frame in the recording. Components are numbered over all sessions: joined
         components of one result have the same number and coordinate frame.
+    stored
+        The recording as the result states it.
     links
         (i, j) frames in the result, of the loop closures between its sessions; empty for all but
         the first session of a result.
@@ -51,6 +53,7 @@ class Session:
     recording: Recording
     config: Config
     stated: Mapping[int, given.StatedPose]
+    stored: reopening.StoredRecording
     links: tuple[tuple[int, int], ...] = ()
 
     @property
@@ -157,7 +160,7 @@ def _session(
     config = adaptation.adapted(config, recording, threads, progress)
     recording, config = adaptation.with_known_odometry(recording, config, odometry_scale)
     opening = reopening.locate_recording(part.opening, folder)
-    return Session(part.name, folder, opening, recording, config, stated)
+    return Session(part.name, folder, opening, recording, config, stated, part)
 
 
 def _stated(folder: Path, run: dict[str, Any], components: int) -> dict[int, given.StatedPose]:
@@ -204,7 +207,7 @@ def with_given_poses(config: Config) -> Config:
 def _check_different(first: Session, second: Session) -> None:
     """Raise InputError if frames of one recording are in both sessions."""
     common = first.posed.keys() & second.posed.keys()
-    if first.opening.source == second.opening.source and common:
+    if common and reopening.is_same(first.stored, second.stored):
         raise InputError(
             f"is of the same recording as {first.result}: {len(common)} frames are in both",
             where=second.result,

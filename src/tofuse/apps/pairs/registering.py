@@ -19,13 +19,13 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number, discover, name_of, registered
 from tofuse.engine.quantities import percent
 from tofuse.engine.search import pose_probability
+from tofuse.formats.recordings import FACTORS
 
 # Packages with registration methods.
 _METHODS = ("tofuse.engine.icp", "tofuse.engine.clouds", "tofuse.lab.methods")
 # Risks that poses are accepted at: the engine rejects those beyond the largest.
 MAX_RISK = round(1 - pose_probability.ACCEPTED, 6)
 RISKS = Bounds(0, MAX_RISK)
-FACTORS = Bounds(1e-6, 1e6)
 
 
 @signals_as_themselves()

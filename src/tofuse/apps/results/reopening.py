@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any, cast
 
@@ -58,23 +59,31 @@ def check_different(folders: Sequence[Path]) -> None:
 
     Results that don't state their recordings are taken for different ones.
     """
-    seen: dict[tuple[object, int], Path] = {}
+    seen: list[tuple[StoredRecording, Path]] = []
     for folder in folders:
         with run_json.opened(folder) as run:
             try:
                 parts = list(stored_recordings(folder, run))
             except InputError:
                 continue
-        for part in parts:
-            source = part.opening.source
-            for index in part.frames:
-                other = seen.setdefault((source, index), folder)
-                if other is not folder:
-                    raise InputError(
-                        f"is of the same recording as {other}: its errors are the same",
-                        where=folder,
-                        remedy="pass results of different recordings",
-                    )
+        for part, (earlier, other) in product(parts, list(seen)):
+            has_common = not set(part.frames).isdisjoint(earlier.frames)
+            if other is not folder and has_common and is_same(part, earlier):
+                raise InputError(
+                    f"is of the same recording as {other}: its errors are the same",
+                    where=folder,
+                    remedy="pass results of different recordings",
+                )
+        seen += [(part, folder) for part in parts]
+
+
+def is_same(first: StoredRecording, second: StoredRecording) -> bool:
+    """Return whether recordings are one, or copies, whose images all have the same mean depths."""
+    if first.opening.source == second.opening.source:
+        return True
+    known = first.depths.keys() & second.depths.keys()
+    is_equal = all(first.depths[k] == second.depths[k] for k in known)
+    return is_equal and len({first.depths[k] for k in known}) > 1
 
 
 def stored_recordings(folder: Path, run: Mapping[str, Any]) -> Iterator[StoredRecording]:

@@ -350,6 +350,8 @@ class CloudFrame:
             array = array - shift if shift.any() else array
             # False for NaN; the squares of the remaining coordinates fit into float32.
             valid = (np.abs(array) < se3.MAX_COORDINATE_M).all(1)
+        if shift.any():
+            _check_rounding(np.asarray(points).dtype, array[valid], shift)
         if not valid.all():
             array = array[valid]
             columns = {name: v if v is None else v[valid] for name, v in columns.items()}
@@ -456,6 +458,22 @@ def map_shift(points: NDArray[np.floating]) -> Float64:
     if np.abs(centre).max() <= _MAP_COORDINATES_M:
         return np.zeros(3)
     return np.asarray(np.round(centre))
+
+
+# Of the extent of a view: surfaces show no shape at coarser steps.
+_MAX_STEP = 0.01
+
+
+def _check_rounding(dtype: np.dtype[Any], points: Float64, shift: Float64) -> None:
+    """Refuse map coordinates, of points about `shift`, that their type rounds too much."""
+    if dtype.kind != "f":
+        return
+    step = float(np.spacing(np.abs(shift).max().astype(dtype)))
+    if step > _MAX_STEP * np.median(np.abs(points).max(1, initial=0)):
+        raise InputError(
+            f"has map coordinates that {8 * dtype.itemsize}-bit floats round to {step:.2g} m",
+            remedy="export it with double precision, or relative to a point nearby",
+        )
 
 
 def _check_columns(index: int, count: int, columns: Mapping[str, ArrayLike | None]) -> None:

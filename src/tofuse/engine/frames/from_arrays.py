@@ -133,8 +133,9 @@ def _images(
         # A masked pixel has no value; `asarray` would return what is under the mask.
         images: list[Any] = [v if v is None else np.ma.filled(v, 0) for v in values]
     except TypeError as error:
+        # Of tensors on a GPU it is the error that says what to do.
         raise InputError(
-            "is not an array of images", where=name, remedy="pass (N, H, W)"
+            f"is not an array of images ({error})", where=name, remedy="pass (N, H, W)"
         ) from error
     if not images:
         raise InputError("contains no image", where=name)
@@ -188,6 +189,12 @@ def _to_metres(
     is_integer = images[0].dtype.kind in "iu"
     scale = unit_m if unit_m is not None else (_MILLIMETRES if is_integer else 1.0)
     check_number(scale, Bounds(0, exclusive=True), "depth_unit_m")
+    if unit_m is None and is_integer and images[0].dtype.itemsize == 1:
+        raise InputError(
+            f"is {images[0].dtype}, which ends at 255 mm",
+            where="depth",
+            remedy="pass images of 16 bits, or depth_unit_m",
+        )
     if unit_m is None and not is_integer:
         sample = np.concatenate([image[::7, ::7].ravel() for image in images[:8]])
         sample = sample[np.isfinite(sample) & (sample > 0)]

@@ -68,17 +68,17 @@ class FrameSequence:
             return
         problem = ""
         if self._times and frame.timestamp <= self._times[-1]:
-            problem = f"is {frame.timestamp:.10g}, after {self._times[-1]:.10g}"
+            problem = f" is {frame.timestamp:.10g}, after {self._times[-1]:.10g}"
         self._times = [*self._times[-_TIMES:], frame.timestamp]
         try:
             if not problem and len(self._times) > 1:
                 check_seconds(np.array(self._times))
         except InputError as error:
-            problem = error.problem
+            problem = f"s {error.problem}"
         if problem:
             self._times = None
             warnings.warn(
-                f"frame {frame.index}: timestamp {problem}; motion is predicted by times: pass "
+                f"frame {frame.index}: timestamp{problem}; motion is predicted by times: pass "
                 "seconds that ascend, and leave out frames that repeat",
                 InputWarning,
                 stacklevel=4,
@@ -196,7 +196,8 @@ class FrameLog:
             remedy = "check it with `tofuse inspect`, and the limits of depth and the filters"
             depths = [e.record.mean_depth_m or 0.0 for e in entries]
             if np.nanmedian(depths) > _FAR_M:
-                remedy = f"depth must be in m; here it is {np.nanmedian(depths):.0f} m on average"
+                mean = f"{np.nanmedian(depths):.0f} m"
+                remedy = f"depth must be in m; here it is {mean} on average: use --factor"
             raise InputError(
                 f"has {quantities.count(len(entries), 'frame')}, none with enough valid points "
                 f"for a pose (first: {entries[0].record.reason})",

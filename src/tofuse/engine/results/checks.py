@@ -330,6 +330,8 @@ def _motion(e: Evidence) -> Iterator[Reason]:
     is_still = np.linalg.norm(moved[:, :3, 3], axis=1) < STILL_M
     if len(T) > 2 and (is_still & (se3.angle(moved) < STILL_RAD)).all():
         text = f"The camera never moved in {len(T)} frames: the model is that of a single view."
+        if e.scans:
+            text = f"The {len(T)} clouds fit as they are: all are in one frame, or of one place."
         yield Reason("stood_still", e.posed_range, text)
 
 

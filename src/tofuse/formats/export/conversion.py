@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from tofuse.engine import quantities
-from tofuse.engine.arrays import UInt8
+from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.cameras import Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import (
@@ -31,6 +31,7 @@ from tofuse.formats.poses import write_log, write_tum
 from tofuse.formats.readers import NativeSource
 from tofuse.formats.recordings import RecordingWriter
 from tofuse.formats.rigs import check_one_camera
+from tofuse.formats.sources import GRAVITY
 
 FINEST_UNIT_M = 1e-4
 MIN_SIGMA_UNIT_M = 1e-5
@@ -84,6 +85,7 @@ def _write(recording: Recording, folder: Path) -> tuple[int, list[str]]:
     writer = _writer(recording, sample, folder, camera_per_frame)
     channels = _channels(sample)
     written: list[int] = []
+    ups: list[Float64 | None] = []
     for k, item in enumerate(recording.read_all()):
         if isinstance(item, UnreadableFrameError):
             warnings.append(f"skipped: {item}")
@@ -96,12 +98,14 @@ def _write(recording: Recording, folder: Path) -> tuple[int, list[str]]:
             )
         writer.add(_with_channels(item, channels))
         written.append(k)
+        ups.append(item.up if isinstance(item, CloudFrame) else None)
     if not written:
         raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
-    _finish(recording, writer, written, correction)
+    _finish(recording, writer, written, correction, _gravity_of(ups))
     if writer.out_of_range:
         warnings.append(f"{quantities.count(writer.out_of_range, 'value')} too large for 16 bits")
-    if any(isinstance(f, CloudFrame) and f.origin.any() for f in sample):
+    clouds = [f for f in sample if isinstance(f, CloudFrame)]
+    if any((f.origin + f.shift).any() for f in clouds):
         warnings.append("the sensor's position within its clouds is lost")
     if NOISE_MODEL in recording.metadata:
         write_noise(folder / "noise.json", recording.metadata[NOISE_MODEL])
@@ -213,6 +217,7 @@ def _finish(
     writer: RecordingWriter,
     written: list[int],
     correction: DepthCorrection | None,
+    gravity: dict[str, Float64] | None,
 ) -> None:
     columns = getattr(recording.source, "frame_columns", None)
     source_indices = recording.indices[written]
@@ -220,7 +225,8 @@ def _finish(
         groundtruth=None if recording.reference is None else recording.reference[written],
         odometry=None if recording.odometry is None else recording.odometry[written],
         correction=correction,
-        imu=getattr(recording.source, "imu", None),
+        imu=getattr(recording.source, "imu", None)
+        or (gravity and {"timestamp": recording.timestamps[written]} | gravity),
         frames=None
         if columns is None
         else {
@@ -229,6 +235,13 @@ def _finish(
             if not (writer.camera_per_frame and n in camera_file.LENS_COLUMNS)
         },
     )
+
+
+def _gravity_of(ups: list[Float64 | None]) -> dict[str, Float64] | None:
+    """The columns of imu.csv that state what is up in clouds; None unless that is known of all."""
+    if any(up is None for up in ups):
+        return None
+    return dict(zip(GRAVITY, -np.array(ups).T, strict=True))
 
 
 Layout = Literal["tum", "open3d"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import suppress
 from pathlib import Path
 
@@ -81,6 +82,9 @@ def _camera(files: list[Path]) -> Camera | None:
     return organised.common_camera(images)
 
 
+_TRIPLES = ("nx", "ny", "nz"), ("r", "g", "b"), ("red", "green", "blue")
+_AMPLITUDES = "intensity", "amplitude", "reflectance", "i"
+_HEAD_LINES = 8
 _SUFFIXES = (".xyz", ".xyzn", ".xyzrgb", ".asc", ".pts")
 
 
@@ -88,9 +92,10 @@ _SUFFIXES = (".xyz", ".xyzn", ".xyzrgb", ".asc", ".pts")
 class XyzClouds(cloud_files.CloudReader):
     """A .xyz, .xyzn, .xyzrgb, .asc or .pts file, or a folder of them; metres.
 
-    The fourth column of four is an amplitude. Columns four to six (of seven in .pts, after the
-    intensity, five to seven) are normals in .xyzn, and where all have length 1; colours in .xyzrgb
-    (0 to 1), and where all are integers up to 255. Other columns are ignored.
+    A line before the numbers that names x, y and z tells the columns. Without one the fourth of
+    four is an amplitude, and columns four to six (of seven in .pts, after the intensity, five to
+    seven) normals or colours. Three columns are normals in .xyzn, and where all have length 1;
+    colours in .xyzrgb (0 to 1), and where all are integers up to 255. Others are ignored.
     """
 
     suffixes = _SUFFIXES
@@ -101,36 +106,64 @@ class XyzClouds(cloud_files.CloudReader):
 
 
 def xyz_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
-    """Read one file: lines of numbers, maybe after one with their count or with names."""
+    """Read one file: lines of numbers, maybe after their count, names of columns and comments."""
     text = reading.read_text(path)
-    table = tables.parse_numbers(text, path, skip=int(_has_head(text)))
+    skip, names = _head(text)
+    table = tables.parse_numbers(text, path, skip=skip)
     if table.shape[1] < 3:
         raise InputError(
             f"has {quantities.count(table.shape[1], 'number')} per line",
             where=path,
             remedy="write x y z",
         )
-    normals = color = None
-    if table.shape[1] >= 6:
+    points, triples, scalars = table[:, :3], [], _fourth(table)
+    named = dict(zip(names, table.T, strict=False))
+    if len(named) == table.shape[1] and set("xyz") <= named.keys():
+        # In the order of the file: surveyors' y and x, east and north, are right-handed so.
+        points = np.stack([column for name, column in named.items() if name in "xyz"], 1)
+        triples = [
+            np.stack([named[name] for name in triple], 1)
+            for triple in _TRIPLES
+            if set(triple) <= named.keys()
+        ]
+        amplitude = next((named[name] for name in _AMPLITUDES if name in named), None)
+        scalars = {} if amplitude is None else {"amplitude": cloud_files.to_float32(amplitude)}
+    elif table.shape[1] >= 6:
         first = 4 if path.suffix.lower() == ".pts" and table.shape[1] == 7 else 3
-        columns = table[:, first : first + 3]
+        triples = [table[:, first : first + 3]]
+    normals = color = None
+    for columns in triples:
         if path.suffix.lower() == ".xyzrgb":
             color = np.clip(np.rint(np.nan_to_num(columns) * 255), 0, 255).astype(np.uint8)
         elif path.suffix.lower() == ".xyzn" or _are_unit(columns):
             normals = cloud_files.to_float32(columns)
         elif ((columns >= 0) & (columns <= 255) & (columns == np.rint(columns))).all():
             color = columns.astype(np.uint8)
-    cloud = GeometryRecord(table[:, :3], None, normals, color, scalars=_fourth(table))
+    cloud = GeometryRecord(points, None, normals, color, scalars=scalars)
     return cloud_files.cloud_frame(index, timestamp, cloud)
 
 
-def _has_head(text: str) -> bool:
-    """Whether the first line is a number of points, or names of columns."""
-    cells = tables.plain_nan(text.split("\n", 1)[0]).replace(",", " ").replace(";", " ").split()
-    with suppress(IndexError, ValueError):
-        float(cells[0])
-        return len(cells) == 1
-    return True
+def _head(text: str) -> tuple[int, list[str]]:
+    """The number of lines before those of numbers, and the names in the last one that is text.
+
+    The names are in small letters and without units.
+    """
+    names: list[str] = []
+    lines = tables.plain_nan("\n".join(text.split("\n", _HEAD_LINES)[:_HEAD_LINES])).split("\n")
+    for k, line in enumerate(lines):
+        cells = re.split(r"[\s,;]+", line.strip("#/,; \t\r"))
+        if _is_number(cells[0]) and len(cells) > 1:
+            return k, names
+        if cells[0] and not _is_number(cells[0]):
+            names = [re.sub(r"\W.*", "", cell.strip('"').lower()) for cell in cells]
+    return 1, names
+
+
+def _is_number(cell: str) -> bool:
+    with suppress(ValueError):
+        float(cell)
+        return True
+    return False
 
 
 def _fourth(table: Float64) -> dict[str, Float32]:

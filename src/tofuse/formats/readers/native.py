@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +107,9 @@ class NativeSource(FileSource):
         """See `FileSource.load`."""
         timestamp = float(self.timestamps[index])
         if self.camera is None:
-            return cloud_files.ply_frame(self.files[index], index, timestamp)
+            cloud = cloud_files.ply_frame(self.files[index], index, timestamp)
+            down = None if self.gravity is None else self.gravity[index, :3]
+            return cloud if down is None or np.isnan(down).any() else replace(cloud, up=-down)
         camera = self._camera_of(index, self.camera)
         depth = self._depth(index)
         if self.correction is not None:

@@ -31,6 +31,7 @@ from tofuse.formats.sources import (
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
 _AMPLITUDE_KEYWORDS = ("/ir/", "/infra", "amplitude", "intensity", "reflec")
+_COMPRESSED_DEPTH = "compresseddepth"  # ends topics of the transport that is for depth alone
 _COLOR_KEYWORDS = ("color", "colour", "rgb")
 # Topics of rectified images, of which CameraInfo's P is the lens, without distortion.
 _RECTIFIED = re.compile(r"(?<![a-z])rect(?![a-z])|rectified")
@@ -135,7 +136,7 @@ class RosSource(bags.BagSource):
     def _candidates(self) -> list[Any]:
         """The connections that may contain depth, most likely first."""
         return sorted(
-            (c for c in self.bag.connections if _rank(c) is not None),
+            (c for c in self.bag.connections if _rank(c) is not None and self._may_be_depth(c)),
             key=lambda c: (_rank(c), c.topic),
         )
 
@@ -160,9 +161,16 @@ class RosSource(bags.BagSource):
             "another name, choose it with --topic",
         )
 
+    def _may_be_depth(self, connection: Any) -> bool:
+        """Whether a compressed image is not one of colour, by what it was compressed from."""
+        if connection.msgtype != COMPRESSED or connection.topic.lower().endswith(_COMPRESSED_DEPTH):
+            return True
+        return self._encoding(connection).split(";")[0] in bags.ENCODINGS
+
     def _encoding(self, connection: Any) -> str:
+        name = "format" if connection.msgtype == COMPRESSED else "encoding"
         for _, _, raw in self.bag.messages(connections=[connection]):
-            return str(self.bag.deserialize(raw, connection.msgtype).encoding)
+            return str(getattr(self.bag.deserialize(raw, connection.msgtype), name))
         return ""
 
     def _read_camera(self, options: ReaderOptions) -> None:
@@ -174,15 +182,28 @@ class RosSource(bags.BagSource):
         infos = _alike_first(infos, self.connection)
         adjacent = self._camera_infos(self.connection)
         candidates = (
-            adjacent or [c for c in infos if "depth" in c.topic] or infos[: len(infos) == 1]
+            adjacent
+            or [c for c in infos if "depth" in c.topic]
+            or infos[: len(infos) == 1]
+            or [c for c in infos if self._is_of_depth(c)]
         )
         if not candidates:
+            others = f", but for others ({', '.join(c.topic for c in infos)})" if infos else ""
             raise InputError(
-                f"has no CameraInfo for {self.connection.topic}",
+                f"has no CameraInfo for {self.connection.topic}{others}",
                 where=self.path,
                 remedy="pass the depth camera with --camera camera.json",
             )
         self.camera = self._lens_of(candidates[0], self.connection, self._depth_size())
+
+    def _is_of_depth(self, info: Any) -> bool:
+        """Whether a CameraInfo states the frame and the size of the depth images."""
+        for _, _, raw in self.bag.messages(connections=[info]):
+            message = self.bag.deserialize(raw, info.msgtype)
+            frame = bags.frame_name(message.header.frame_id)
+            size = message.width, message.height
+            return frame == self._frame_of(self.depth) and size == self._depth_size()
+        return False
 
     def _camera_infos(self, connection: Any) -> list[Any]:
         """The CameraInfo connections in the namespace of an image connection, of like names first.
@@ -244,6 +265,12 @@ class RosSource(bags.BagSource):
             poses = transforms.poses(ancestors[-1], frame, self.timestamps)
             if np.isfinite(poses).any():
                 self.reference = poses
+        moves = transforms.moves(ancestors[-1], frame)
+        if moves and self.reference is None and self.odometry is None:
+            self.warnings.append(
+                f"tf or odometry states how the frame of depth, {frame!r}, moves, but at no time "
+                "of an image: is their clock another one?"
+            )
 
     def _read_gravity(self, transforms: bags.Transforms) -> None:
         """Read the direction of gravity from an accelerometer that is fixed to the camera."""
@@ -323,10 +350,11 @@ class RosSource(bags.BagSource):
         return connection.msgtype == IMAGE and self._encoding(connection).lower() in bags.COLORS
 
     def _depth_size(self) -> tuple[int, int] | None:
-        """Width and height of the first image; None if it can't be read."""
-        where = self.where(0)
+        """Width and height of the middle image, as a mode may change soon; None if unreadable."""
+        middle = (len(self.depth) - 1) // 2
+        where = self.where(middle)
         with suppress(InputError), reading.library_errors(where, bags.REMEDY):
-            message = self.depth.message(0)
+            message = self.depth.message(middle)
             if self.connection.msgtype == IMAGE:
                 return int(message.width), int(message.height)
             height, width = bags.decompressed(message, where).shape
@@ -334,14 +362,25 @@ class RosSource(bags.BagSource):
         return None
 
     def _lens_of(self, info: Any, images: Any, size: tuple[int, int] | None) -> Pinhole:
-        """The lens of a CameraInfo for a topic of images of a size (width, height)."""
+        """The lens of a CameraInfo for a topic of images of a size (width, height).
+
+        That of the first message of this size, or else of the first that states a lens: drivers
+        write zeros until they know it.
+        """
         where = f"{self.path}: {info.topic}"
         rectified = _RECTIFIED.search(images.topic.lower()) is not None
+        best, best_rank = None, -1
         for _, _, raw in self.bag.messages(connections=[info]):
             message = self.bag.deserialize(raw, info.msgtype)
-            lens = bags.lens(message, where, rectified=rectified)
-            return lens if size is None else bags.shown_part(lens, message, size)
-        raise InputError("has no message", where=where, remedy="use --camera camera.json")
+            rank = bags.info_rank(message, where, size)
+            if rank > best_rank:
+                best, best_rank = message, rank
+            if rank == bags.FITS:
+                break
+        if best is None:
+            raise InputError("has no message", where=where, remedy="use --camera camera.json")
+        lens = bags.lens(best, where, rectified=rectified)
+        return lens if size is None else bags.shown_part(lens, best, size)
 
     def _find_amplitude(self) -> bags.Track | None:
         """The amplitude track of the same sensor: its images match the depth's size and times."""
@@ -353,8 +392,8 @@ class RosSource(bags.BagSource):
             if not is_named or self._encoding(connection) not in bags.GREY:
                 continue
             track = bags.Track(self.bag, connection)
-            first = track.message(0)
-            if (first.height, first.width) != (self.camera.height, self.camera.width):
+            middle = track.message((len(track) - 1) // 2)
+            if (middle.height, middle.width) != (self.camera.height, self.camera.width):
                 continue
             has_match = [track.nearest(t, bags.MAX_GAP_S) is not None for t in self.timestamps]
             if sum(has_match) > 0.5 * len(has_match):
@@ -392,7 +431,7 @@ def _rank(connection: Any) -> int | None:
             keyword in topic for keyword in ("align", "regist", "_to_", "color", "rgb")
         )
         return 1 if registered else 0
-    if kind == COMPRESSED and topic.endswith("compresseddepth"):
+    if kind == COMPRESSED and "depth" in topic:
         return 2
     # DepthAI's driver calls its depth /oak/stereo/image_raw.
     if kind == IMAGE and any(word in topic for word in ("distance", "range", "/stereo/image")):

@@ -6,6 +6,7 @@ import os
 import re
 import struct
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,8 @@ MAX_POINTS = 100_000_000
 _E57 = b"ASTM-E57"
 _MAX_COMPRESSION = 1000  # of LAZ; scans reach 4 to 15
 # GeoTIFF's key of the unit of projected coordinates, its codes of feet, and their names in WKT.
-_LINEAR_UNIT, _FEET = 3076, {9002, 9003}
+_LINEAR_UNIT, _SURVEY_FOOT = 3076, 9003
+_FEET = {9002, _SURVEY_FOOT}
 _WKT_FEET = re.compile(r"UNIT\s*\[\s*\"[^\"]*(foot|feet|ft)", re.IGNORECASE)
 _COPY = "copy the file again, or export it again"
 
@@ -38,6 +40,13 @@ class LasScans(cloud_files.CloudReader):
     def source(self, path: Path, files: list[Path]) -> cloud_files.CloudFileSource:
         """See `CloudReader.source`."""
         return cloud_files.CloudFileSource(path, files, _las_frame)
+
+    def open(self, path: Path, options: ReaderOptions) -> cloud_files.CloudFileSource:
+        """See `Reader.open`."""
+        source = super().open(path, options)
+        if options.factor is not None:
+            source.load_frame = partial(_las_frame, any_unit=True)
+        return source
 
 
 def _las_header(path: Path) -> Any:
@@ -124,31 +133,36 @@ def _check_unit(header: Any, path: Path) -> None:
             if key.id == _LINEAR_UNIT
         ]
         text = " ".join(str(getattr(record, "string", "")) for record in header.vlrs)
-    if _FEET & set(keys) or _WKT_FEET.search(text):
+    named = _WKT_FEET.search(text)
+    if _FEET & set(keys) or named:
+        is_survey = _SURVEY_FOOT in keys or (named and re.search(r"us|survey", named[0], re.I))
+        option = f"--factor {'0.3048006096' if is_survey else '0.3048'}"
         raise InputError(
             "has coordinates in feet",
             where=path,
-            remedy="convert it to a coordinate system in metres, as by pdal or CloudCompare",
+            remedy=f"convert it to m by {option} (`tofuse convert`), pdal or CloudCompare",
         )
 
 
-def read_las(path: Path) -> Any:
+def read_las(path: Path, *, any_unit: bool = False) -> Any:
     """Return the `laspy.LasData` of a file, whose header is checked first.
 
     Raises
     ------
     InputError
-        If it is damaged, or in feet.
+        If it is damaged, or in feet, unless it may be in `any_unit`.
     """
     import laspy
 
-    _check_unit(_las_header(path), path)
+    header = _las_header(path)
+    if not any_unit:
+        _check_unit(header, path)
     with reading.library_errors(path, _COPY):
         return laspy.read(path)
 
 
-def _las_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
-    points = read_las(path)
+def _las_frame(path: Path, index: int, timestamp: float, *, any_unit: bool = False) -> CloudFrame:
+    points = read_las(path, any_unit=any_unit)
     with reading.library_errors(path, _COPY):
         xyz = np.stack([np.asarray(points[axis], float) for axis in "xyz"], 1)
         names = set(points.point_format.dimension_names)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from tofuse.formats.recordings.joined import JoinedSource
     from tofuse.formats.recordings.native import RecordingWriter
     from tofuse.formats.recordings.open import (
+        FACTORS,
         Opening,
         OpeningOptions,
         SingleView,

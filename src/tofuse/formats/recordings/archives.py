@@ -23,10 +23,11 @@ _OF_SYSTEMS = ("__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini")
 _unpacked: dict[tuple[str, int, int], Path] = {}
 
 
-def unzipped(path: str | Path) -> Path:
+def unzipped(path: str | Path, *, nested: bool = False) -> Path:
     """Return the folder or file that an archive contains, unpacked; other paths as they are.
 
-    A folder that is alone in an archive or in another such folder stands for its content.
+    A folder that is alone in an archive or in another such folder stands for its content, and so
+    does an archive in an archive, as mail programs make them.
 
     Raises
     ------
@@ -45,7 +46,7 @@ def unzipped(path: str | Path) -> Path:
     inside = _unpacked[key]
     while reading.is_folder(inside) and len(children := reading.list_folder(inside)) == 1:
         inside = children[0]
-    return inside
+    return inside if nested else unzipped(inside, nested=True)
 
 
 def _unpack(path: Path) -> Path:

@@ -1,7 +1,8 @@
-"""Sources made of others: several in sequence, or restricted to a range of depths."""
+"""Sources made of others: several in sequence, in another unit, or restricted in depth."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames import Frame, RangeFrame, Source
+from tofuse.engine.frames import CloudFrame, Frame, RangeFrame, Source
 
 
 class JoinedSource:
@@ -101,17 +102,23 @@ def _joined(
     )
 
 
-class LimitedSource:
-    """A source restricted to points between two depths in m: z of images, distance in clouds."""
+# Of an image, m.
+_LENGTHS = ("depth", "sigma_image", "shared_sigma_image")
 
-    def __init__(self, source: Source, min_depth: float, max_depth: float) -> None:
-        self.source, self.min_depth, self.max_depth = source, min_depth, max_depth
+
+class _DerivedSource:
+    """A source whose frames are made of those of another one."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
         self.concurrent = getattr(source, "concurrent", False)
         self.timestamps = source.timestamps
         self.reference = source.reference
         self.odometry = source.odometry
         self.gravity = source.gravity
         self.metadata = source.metadata
+        for name in ("imu", "frame_columns"):  # which conversion keeps
+            setattr(self, name, getattr(source, name, None))
 
     @property
     def warnings(self) -> list[str]:
@@ -124,6 +131,57 @@ class LimitedSource:
 
     def read(self, index: int) -> Frame:
         """See `Source.read`."""
-        frame = self.source.read(index)
+        return self._derived(self.source.read(index))
+
+    @abstractmethod
+    def _derived(self, frame: Frame) -> Frame: ...
+
+
+class ScaledSource(_DerivedSource):
+    """A source in another unit: its depth, or the points and poses of clouds, times a factor."""
+
+    def __init__(self, source: Source, factor: float, *, poses: bool) -> None:
+        super().__init__(source)
+        self.factor = factor
+        units = {name: source.metadata.get(name) for name in ("depth_unit_m", "sigma_unit_m")}
+        scaled = {name: factor * unit_m for name, unit_m in units.items() if unit_m is not None}
+        self.metadata = source.metadata | scaled
+        if poses:
+            scale = np.ones((4, 4))
+            scale[:3, 3] = factor
+            self.reference, self.odometry = (
+                None if T is None else scale * T for T in (source.reference, source.odometry)
+            )
+
+    def _derived(self, frame: Frame) -> Frame:
+        names = ("sigma",) if isinstance(frame, CloudFrame) else _LENGTHS
+        lengths: dict[str, Any] = {
+            name: (self.factor * image).astype(np.float32)
+            for name in names
+            if (image := getattr(frame, name)) is not None
+        }
+        if isinstance(frame, RangeFrame):
+            return replace(frame, **lengths)
+        return CloudFrame.of(
+            self.factor * (frame.points + frame.shift),
+            index=frame.index,
+            timestamp=frame.timestamp,
+            origin=self.factor * (frame.origin + frame.shift),
+            up=frame.up,
+            normals=frame.normals,
+            amplitude=frame.amplitude,
+            color=frame.color,
+            **lengths,
+        )
+
+
+class LimitedSource(_DerivedSource):
+    """A source restricted to points between two depths in m: z of images, distance in clouds."""
+
+    def __init__(self, source: Source, min_depth: float, max_depth: float) -> None:
+        super().__init__(source)
+        self.min_depth, self.max_depth = min_depth, max_depth
+
+    def _derived(self, frame: Frame) -> Frame:
         distance = frame.z if isinstance(frame, RangeFrame) else frame.radial_range
         return frame.keep((distance >= self.min_depth) & (distance <= self.max_depth))

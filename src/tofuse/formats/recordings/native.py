@@ -157,7 +157,7 @@ class RecordingWriter:
         write_ply(
             self._frame_path("cloud", ".ply"),
             GeometryRecord(
-                frame.points,
+                frame.points + frame.shift if frame.shift.any() else frame.points,
                 normals=frame.normals,
                 color=frame.color,
                 scalars={} if frame.amplitude is None else {"amplitude": frame.amplitude},

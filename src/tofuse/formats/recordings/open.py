@@ -22,7 +22,7 @@ from tofuse.formats.files import reading
 from tofuse.formats.geometry import is_surface, read_surface, surface_points
 from tofuse.formats.poses import TimedPoses, read_poses
 from tofuse.formats.recordings.archives import unzipped
-from tofuse.formats.recordings.joined import JoinedSource, LimitedSource
+from tofuse.formats.recordings.joined import JoinedSource, LimitedSource, ScaledSource
 from tofuse.formats.recordings.still import average_still
 from tofuse.formats.rigs import RigSource, read_rig, recordings_of, rig_file_in
 from tofuse.formats.sources import Reader, ReaderOptions, Sniff, inputs, organised
@@ -83,6 +83,9 @@ _REMEDIES = {
     "camera.json (docs/formats.md)",
 }
 
+# Of the unit of a file to m.
+FACTORS = Bounds(1e-6, 1e6)
+
 # A folder with these may contain depth images of an unknown camera.
 _IMAGES = (".png", ".pgm", ".tif", ".tiff")
 
@@ -102,6 +105,7 @@ def open_recording(
     rig: str | Path | None = None,
     min_depth: float | None = None,
     max_depth: float | None = None,
+    factor: float | None = None,
 ) -> Recording:
     """Open a recording; its format is detected from names and contents.
 
@@ -122,6 +126,9 @@ def open_recording(
         A rig.json: the paths are the recordings of its cameras, in its order.
     min_depth, max_depth
         In m; nearer or farther points are dropped: by z in images, by distance in clouds.
+    factor
+        Multiplies the depth of images, or the points and poses of clouds, if they are read in
+        another unit than m: 0.001 for mm.
 
     Raises
     ------
@@ -137,6 +144,8 @@ def open_recording(
         if file is not None:
             reading.path_of(file, name, f"pass the path of a {name}.json")
     _check_depths(min_depth, max_depth)
+    if factor is not None:
+        check_number(factor, FACTORS, "--factor")
     again = partial(
         open_recording,
         *paths,
@@ -146,19 +155,19 @@ def open_recording(
         rig=rig,
         min_depth=min_depth,
         max_depth=max_depth,
+        factor=factor,
     )
     shown_path = " ".join(map(str, paths))
     inner = [unzipped(path) for path in paths]
-    options = ReaderOptions(None if camera is None else Path(camera), topic)
+    options = ReaderOptions(None if camera is None else Path(camera), topic, factor)
     in_folder = rig_file_in(inner[0]) if rig is None and len(inner) == 1 else None
     if in_folder is not None:
         rig, inner = in_folder, list(recordings_of(in_folder).values())
     if rig is not None:
         cameras = _rig_source(Path(rig), inner, format, options)
-        if min_depth is not None or max_depth is not None:
-            raise InputError(
-                "do not apply to a rig", where="min_depth, max_depth", remedy="leave them out"
-            )
+        if (min_depth, max_depth, factor) != (None, None, None):
+            given = "min_depth, max_depth, factor"
+            raise InputError("do not apply to a rig", where=given, remedy="leave them out")
         return Recording.of(cameras, shown_path, "rig", again)
     for path in inner:
         _check_kind(path)
@@ -167,11 +176,13 @@ def open_recording(
     source: Source = sources[0]
     if len(sources) > 1:
         source = JoinedSource(sources, _short_names([item.path for item in located]))
-    _check_usable(source, paths[0])
+    first_frame = _check_usable(source, paths[0])
     if options.camera is not None and (assumption := camera_file.assumption(options.camera)):
         source.warnings.append(assumption)
     if len(inner) == 1:
         _read_noise(source, inner[0])
+    if factor is not None:
+        source = ScaledSource(source, factor, poses=isinstance(first_frame, CloudFrame))
     if min_depth is not None or max_depth is not None:
         source = LimitedSource(
             source, min_depth or 0.0, float("inf") if max_depth is None else max_depth
@@ -294,7 +305,7 @@ def _resolve(
 def _refusal(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> InputError:
     """Why nothing is read at a path, by what is there."""
     suffixes = {p.suffix.lower() for p in (children or [path]) if p.is_file()}
-    if suffixes and suffixes <= _ARCHIVES:
+    if suffixes and suffixes <= _ARCHIVES and not _folders_in(path):
         return InputError(
             "is an archive, or contains only that",
             where=path,
@@ -386,9 +397,12 @@ def _recordings_in(path: Path, options: ReaderOptions) -> list[_Located]:
 
 
 def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) -> InputError:
+    folder = path.absolute().parent
+    whole = folder if _is_sure(folder) else None
     if sniffs:
         evidence = "; ".join(dict.fromkeys(sniff.evidence for sniff in sniffs.values()))
-        remedies = [sniff.remedy or f"use --format {name}" for name, sniff in sniffs.items()]
+        remedies = [] if whole is None else [f"pass the recording's folder, {whole}"]
+        remedies += [sniff.remedy or f"use --format {name}" for name, sniff in sniffs.items()]
         return InputError(
             f"could not be identified: it has {evidence}",
             where=path,
@@ -414,9 +428,8 @@ def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) ->
         kind = f"a {path.suffix!r} file" if path.suffix else "a file without a suffix"
         problem = f"is not a recording of a known format, but {kind}"
         remedy = _REMEDIES.get(path.suffix.lower(), remedy)
-    folder = path.absolute().parent
-    if _is_sure(folder):
-        return InputError(problem, where=path, remedy=f"pass the recording's folder, {folder}")
+    if whole is not None:
+        return InputError(problem, where=path, remedy=f"pass the recording's folder, {whole}")
     return InputError(
         problem, where=path, remedy=f"{remedy}, or use --format ({', '.join(readers())})"
     )
@@ -434,12 +447,12 @@ def _check_depths(min_depth: float | None, max_depth: float | None) -> None:
         )
 
 
-def _check_usable(source: Source, path: str | Path) -> None:
-    """Refuse a recording without a readable frame; stops at the first readable one."""
+def _check_usable(source: Source, path: str | Path) -> Frame:
+    """Return the first readable frame; refuse a recording without one."""
     count = len(source.timestamps)
     nothing = InputError("has no frames", where=path, remedy="pass a recording")
     try:
-        reading.first_readable(range(count), source.read, nothing)
+        return reading.first_readable(range(count), source.read, nothing)
     except UnreadableFrameError as first:
         if count > 1:
             raise InputError(f"none of {count} frames can be read: {first}", where=path) from first
@@ -500,7 +513,7 @@ class OpeningOptions:
 
     Attributes
     ----------
-    format, camera, topic
+    format, camera, topic, factor
         See `open_recording`.
     start, end, every
         The selected frames, see `Recording.select`.
@@ -511,6 +524,7 @@ class OpeningOptions:
     format: str | None = None
     camera: Path | None = None
     topic: str | None = None
+    factor: float | None = None
     start: int = 0
     end: int | None = None
     every: int = 1
@@ -550,7 +564,12 @@ class Opening(OpeningOptions):
     def open(self) -> Recording:
         """Open the recording; InputError if that fails."""
         recording = open_recording(
-            *self.paths, format=self.format, camera=self.camera, topic=self.topic, rig=self.rig
+            *self.paths,
+            format=self.format,
+            camera=self.camera,
+            topic=self.topic,
+            rig=self.rig,
+            factor=self.factor,
         ).select(self.start, self.end, self.every)
         return average_still(recording) if self.average_still else recording
 
@@ -575,6 +594,7 @@ class Opening(OpeningOptions):
                 format=data["format"],
                 camera=None if camera is None else Path(str(camera)),
                 topic=data["topic"],
+                factor=data.get("factor"),
                 start=int(data["start"]),
                 end=None if end is None else int(end),
                 every=int(data["every"]),
@@ -623,6 +643,7 @@ def open_view(
     format: str | None = None,  # noqa: A002
     camera: Path | None = None,
     topic: str | None = None,
+    factor: float | None = None,
     file_axes: bool = False,
 ) -> SingleView:
     """Read the view called `name`; for the options see `open_recording`.
@@ -640,7 +661,7 @@ def open_view(
     if format is None and index is None and is_surface(Path(path)):
         points = surface_points(read_surface(Path(path)), path)
         return _checked(SingleView(name, path, "mesh", 0, CloudFrame.of(points)))
-    recording = open_recording(path, format=format, camera=camera, topic=topic)
+    recording = open_recording(path, format=format, camera=camera, topic=topic, factor=factor)
     count = len(recording)
     if index is None and count > 1:
         raise InputError(

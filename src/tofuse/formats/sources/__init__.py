@@ -13,7 +13,7 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.formats.sources import bags, cloud_files, inputs, organised, phones, pixels
     from tofuse.formats.sources.file_source import DepthImageSource, FileSource
-    from tofuse.formats.sources.imu import ACCELERATION, gravity_at
+    from tofuse.formats.sources.imu import ACCELERATION, GRAVITY, gravity_at
     from tofuse.formats.sources.reader import Reader, ReaderOptions, Sniff
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -31,7 +31,7 @@ from tofuse.formats.sources.imu import ACCELERATION
 from tofuse.formats.sources.pixels import finite_float32, sampled_color
 from tofuse.formats.sources.reader import ReaderOptions
 
-REMEDY = "check the bag, or reindex it"
+REMEDY = "check the bag, or repair it by `mcap recover` or `rosbag reindex`"
 MAX_GAP_S = 0.02  # between the images of one frame
 _PROFILE = 21  # of MCAP's header: after magic, record type, and two lengths
 _MAGIC = {"ros1": b"#ROSBAG V2", "mcap": b"\x89MCAP0\r\n"}
@@ -460,18 +460,32 @@ def lens(message: Any, where: str, *, rectified: bool = False) -> Pinhole:
     return camera_file.checked_lens(MODELS[name], info.size, info.values | coefficients, where)
 
 
+FITS = 2
+
+
+def info_rank(message: Any, where: str, size: tuple[int, int] | None) -> int:
+    """Return `FITS` for the lens of images of a size, 1 for another lens, 0 for zeros."""
+    if camera_info(message, where).values["fx"] == 0:
+        return 0
+    return FITS if size in (None, *_sizes(message)) else 1
+
+
+def _sizes(message: Any) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Width and height that a CameraInfo states, and those of its binned region of interest."""
+    whole, roi = (int(message.width), int(message.height)), message.roi
+    width, height = roi.width or whole[0], roi.height or whole[1]
+    return whole, (width // max(message.binning_x, 1), height // max(message.binning_y, 1))
+
+
 def shown_part(lens: Pinhole, message: Any, size: tuple[int, int]) -> Pinhole:
     """Return the lens of images of a size (width, height) from that of a CameraInfo.
 
     Unless they have its size, they are the region of interest that it states, or binned.
     """
-    roi, binning = message.roi, (max(message.binning_x, 1), max(message.binning_y, 1))
-    width, height = (
-        (roi.width or lens.width) // binning[0],
-        (roi.height or lens.height) // binning[1],
-    )
-    if size == (lens.width, lens.height) or size != (width, height):
+    whole, (width, height) = _sizes(message)
+    if size == whole or size != (width, height):
         return lens
+    roi, binning = message.roi, (max(message.binning_x, 1), max(message.binning_y, 1))
     fx, cx = lens.fx / binning[0], (lens.cx - roi.x_offset) / binning[0]
     fy, cy = lens.fy / binning[1], (lens.cy - roi.y_offset) / binning[1]
     return replace(lens, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)

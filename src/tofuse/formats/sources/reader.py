@@ -51,10 +51,13 @@ class ReaderOptions:
         A camera.json that replaces the recording's own.
     topic
         Of a bag, instead of the detected one.
+    factor
+        By which all lengths will be multiplied, whatever their unit; None if they must be in m.
     """
 
     camera: Path | None = None
     topic: str | None = None
+    factor: float | None = None
 
 
 @dataclass(frozen=True)
