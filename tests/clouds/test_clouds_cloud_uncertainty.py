@@ -76,6 +76,18 @@ def test_wall_constrains_three_directions():
     assert towards @ information @ towards > 1 / 0.01**2
 
 
+def test_motions_that_patches_leave_open_have_no_information():
+    rng = np.random.default_rng(0)
+    walls = [
+        CloudFrame.of(np.c_[rng.uniform(-1, 1, (4000, 2)), np.full(4000, 2.0)], index=k)
+        for k in range(2)
+    ]
+    # Those along an exact plane, though none is excluded.
+    information = cloud_information(*maps(*walls), np.eye(4), np.zeros((0, 6)))
+    assert np.isfinite(information).all()
+    assert information[0, 0] < 1e-2 * information[2, 2]
+
+
 def test_clouds_without_overlap_have_no_information():
     cloud = view(bumpy_ball(2000, 0))
     source, target = maps(cloud, CloudFrame.of(cloud.points + np.array([30.0, 0, 0])))

@@ -44,6 +44,8 @@ _STEEPNESS, _DIFFERENCE_POINTS = 0.1, 1500
 _MIN_SIGMA = 1e-3
 # Sigma along degenerate directions, in sizes of the overlap, or in rad.
 _UNBOUNDED = 100.0
+# Singular values below this fraction of the largest are zero.
+_NEGLIGIBLE = 1e-9
 
 
 def cloud_information(
@@ -231,16 +233,14 @@ class _Patches:
 
 def _information(pairs: _Pairs, hessian: Float64, unit: Float64, unobservable: Float64) -> Float64:
     """Return the information (6, 6) about the centroid, degenerate along `unobservable` (k, 6)."""
-    constrained = np.eye(6)
-    H = np.zeros((6, 6))
-    if len(unobservable):
-        _, s, vt = np.linalg.svd(unobservable)
-        count = int((s > 1e-9 * s[0]).sum())
-        constrained = vt[count:].T
-        H += vt[:count].T @ vt[:count] / (_UNBOUNDED * pairs.size) ** 2
+    constrained = _complement(unobservable, np.eye(6))
+    patches = _Patches.of(pairs, unit)
+    if len(patches.residual) >= _MIN_PATCHES:  # these may leave more motions open
+        _, s, vt = np.linalg.svd(patches.responses @ constrained, full_matrices=False)
+        constrained = _complement(vt[s <= _NEGLIGIBLE * s[0]] @ constrained.T, constrained)
+    H = (np.eye(6) - constrained @ constrained.T) / (_UNBOUNDED * pairs.size) ** 2
     if not constrained.shape[1]:
         return H
-    patches = _Patches.of(pairs, unit)
     if len(patches.residual) >= _MIN_PATCHES:
         meat = _posterior_meat(patches, patches.responses @ constrained)
     else:  # too few patches for the field: assume neighbourhoods to be fully correlated
@@ -258,6 +258,14 @@ def _information(pairs: _Pairs, hessian: Float64, unit: Float64, unobservable: F
     C = bread @ meat @ bread + 0.5 * np.outer(step, step)
     C += (_MIN_SIGMA * pairs.resolution) ** 2 / len(pairs.points) * np.eye(len(C))
     return np.asarray(H + constrained @ np.linalg.inv(C) @ constrained.T, np.float64)
+
+
+def _complement(directions: Float64, within: Float64) -> Float64:
+    """Return a basis (6, m) of what is perpendicular to directions (k, 6), within a basis."""
+    if not len(directions):
+        return within
+    _, s, vt = np.linalg.svd(directions @ within)
+    return within @ vt[int((s > _NEGLIGIBLE * s[0]).sum()) :].T
 
 
 def _hessian(
