@@ -27,7 +27,8 @@ from tofuse.engine.clouds.cloud_agreement import (
     cloud_agreement,
 )
 from tofuse.engine.clouds.cloud_uncertainty import cloud_information, cloud_unobservable
-from tofuse.engine.clouds.fpfh import MATCH_WEIGHT, Candidates, candidates, log_matches
+from tofuse.engine.clouds.fpfh import MATCH_WEIGHT, candidates, log_matches
+from tofuse.engine.clouds.proposals import Proposals, proposals
 from tofuse.engine.clouds.repetition import shifts
 from tofuse.engine.clouds.robust_motion import are_distinct
 from tofuse.engine.errors import RegistrationError
@@ -49,6 +50,9 @@ from tofuse.engine.search import pose_probability
 _POINTS = 7_000
 # Number of proposals that are aligned at full resolution, and if none of these is likely.
 _MAX_REFINED, _MANY_REFINED = 3, 12
+_FIRST = 0
+# Points of the source that align a pose.
+_REFINED_POINTS = 2000
 # Weight of the log of the matches in the rank of a pose, relative to that of its surfaces.
 _MATCH_RANK = 0.5
 # Poses that differ by more resolutions, or rad, are distinct hypotheses.
@@ -162,7 +166,7 @@ class _CloudViews:
         """Align with a subset of the averaged source's points; T (4, 4) if that scores lower."""
         initial = self.evaluated(T)
         try:
-            for icp in _refinement_stages(self.size):
+            for icp in _refinement_stages(self.size)[_FIRST:]:
                 T = icp.register(
                     self.source_map.view, self.target_map.view, T, self.rng
                 ).T_target_source
@@ -307,35 +311,32 @@ def _registered_views(
         poses.append(views.evaluated(image_registration.T_target_source))
     proposed, found = _proposed(views, start, guessed=guess is not None)
     poses += proposed
-    more = [] if found is None else list(found.poses[_MAX_REFINED:_MANY_REFINED])
-    if not _may_be_likely(views, poses, found):
-        poses += [views.refined(c.T_target_source) for c in more]
-        more = []
-    best = _best(views, poses, found, local, guess, certain)
-    if more and (best.probability or 0.0) >= _LIKELY:
-        is_rival = partial(views.are_distinct_poses, best.T_target_source)
-        # Without a rival, its lead is unknown.
-        has_rival = any(is_rival(pose.T_target_source) for pose in proposed)
-        more = [] if has_rival else [c for c in more if is_rival(c.T_target_source)]
-    if more:
-        poses += [views.refined(c.T_target_source) for c in more]
-        best = _best(views, poses, found, local, guess, certain)
-    return views.with_information(best)
+    poses += [views.refined(T) for T in _others(views, poses, found)]
+    return views.with_information(_best(views, poses, found, local, guess, certain))
 
 
-def _may_be_likely(views: _CloudViews, poses: list[_Pose], found: Candidates | None) -> bool:
-    """Whether the best pose is likely if no better rival than the other poses is found."""
+def _others(views: _CloudViews, poses: list[_Pose], found: Proposals | None) -> Sequence[Float64]:
+    """Return the proposals to align beside the first: all if none of the poses can be likely.
+
+    Else only the one that might be the strongest rival of the best, as it is.
+    """
+    if found is None:
+        return []
+    more = list(found.motions[_MAX_REFINED:_MANY_REFINED])
     best, *others = _ranked(poses, found)
-    rivals = [
-        p for p in others if views.are_distinct_poses(p.T_target_source, best.T_target_source)
-    ]
-    return views.evidence(best, 1.0, rivals=rivals).probability >= _LIKELY
+    is_rival = partial(views.are_distinct_poses, best.T_target_source)
+    known = [pose for pose in others if is_rival(pose.T_target_source)]
+    if views.evidence(best, 1.0, rivals=known).probability < _LIKELY:
+        return more
+    rivals = [views.evaluated(T) for T in more if is_rival(T)]
+    rivals.sort(key=lambda rival: -_surfaces_of(rival.agreement, best.agreement))
+    return [rival.T_target_source for rival in rivals[:1]]
 
 
 def _best(
     views: _CloudViews,
     poses: list[_Pose],
-    found: Candidates | None,
+    found: Proposals | None,
     local: _Pose,
     guess: Float64 | None,
     certain: Registration | None,
@@ -350,7 +351,8 @@ def _best(
         poses = _ranked([*poses, *moved], found)
     best = poses[0]
     if guess is not None:
-        tied = [p for p in poses if p.score >= best.score - _MIN_LEAD]
+        least = best.agreement.score - _MIN_LEAD
+        tied = [p for p in poses if p.agreement.score >= least]
         best = min(tied, key=lambda p: _pose_distance(p.T_target_source, guess))
     registration = _registration(views, best, poses)
     if certain is not None and registration.believed:
@@ -452,7 +454,7 @@ def follow_clouds(
 
 def _proposed(
     views: _CloudViews, start: Float64, *, guessed: bool
-) -> tuple[list[_Pose], Candidates | None]:
+) -> tuple[list[_Pose], Proposals | None]:
     """Return the poses of feature matching; without any, or if they don't support more than a
     guess might, also that of coarse-to-fine ICP.
 
@@ -463,8 +465,8 @@ def _proposed(
     """
     poses, found, failure = [], None, None
     try:
-        found = candidates(views.source, views.target, signed=views.has_free_space)
-        poses += [views.refined(c.T_target_source) for c in found.poses[:_MAX_REFINED]]
+        found = proposals(views.source, views.target, signed=views.has_free_space)
+        poses += [views.refined(T) for T in found.motions[:_MAX_REFINED]]
     except RegistrationError as error:
         failure = error
     supported = any(pose.agreement.support > _MIN_SUPPORT for pose in poses)
@@ -480,10 +482,10 @@ def _proposed(
     return poses, found
 
 
-def _ranked(poses: list[_Pose], found: Candidates | None) -> list[_Pose]:
+def _ranked(poses: list[_Pose], found: Proposals | None) -> list[_Pose]:
     """Return poses with the feature matches that agree with them, the highest rank first."""
     if found is not None:
-        matches = found.matches_at(np.array([pose.T_target_source for pose in poses]))
+        matches = found.pair.matches_at(np.array([pose.T_target_source for pose in poses]))
         poses = [replace(p, matches=float(count)) for p, count in zip(poses, matches, strict=True)]
     return sorted(poses, key=lambda pose: -pose.rank)
 
@@ -595,7 +597,7 @@ def _refinement_stages(size: float) -> tuple[Icp, ...]:
     """Return ICP with few iterations, first with a wide reach, then with a narrow one."""
     wide = Icp(
         size,
-        source=icp_parts.Uniform(800),
+        source=icp_parts.Uniform(_REFINED_POINTS),
         target=icp_parts.All(),
         rejectors=(icp_parts.MaxDistance(4.0),),
         metric=surface_metrics.PointToPlane(loss="tukey"),

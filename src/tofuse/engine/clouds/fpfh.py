@@ -39,7 +39,7 @@ _SURROUNDINGS, _SURROUNDINGS_REACH = 2.0, 6.0
 # Each point is matched with this many, if it is among as many nearest of theirs.
 _MATCHES = 2
 # Sets of compatible matches that propose motions.
-_SEEDS = 1000
+SEEDS = 1000
 # Sampling noise of an averaged point along each axis, and maximum distance of points that fit, in
 # resolutions.
 _SAMPLING_SIGMA, _FIT_DISTANCE = 0.4, 2.0
@@ -100,13 +100,36 @@ def candidates(
     RegistrationError
         If too few matches agree on a motion.
     """
+    options = options or ConsensusOptions(seeds=SEEDS)
+    pair = matched(
+        source,
+        target,
+        points=points,
+        reach=reach,
+        neighbours=neighbours,
+        signed=signed,
+        options=options,
+    )
+    found = consensus(pair.pairs, pair.options, motions)
+    T = np.array([c.T_target_source for c in found])
+    score, inlier_ratio = pair.evaluated(T)
+    best = np.argsort(-score, kind="stable")
+    return Candidates(pair, tuple(Candidate(T[k], float(inlier_ratio[k]), found[k]) for k in best))
+
+
+def matched(
+    source: Frame,
+    target: Frame,
+    *,
+    points: int = POINTS,
+    reach: float = REACH,
+    neighbours: int = FPFH_NEIGHBOURS,
+    signed: bool,
+    options: ConsensusOptions,
+) -> MatchedPair:
+    """Describe and match the points of two views; see `candidates`."""
     size = _COARSER * max(spacing(source), spacing(target))
     size, data, model = reduced(source, target, size, points)
-    options = replace(
-        options or ConsensusOptions(seeds=_SEEDS),
-        distinct_m=_DISTINCT * size,
-        distinct_rad=_DISTINCT_RAD,
-    )
     described = [
         _described(view, size, reach, neighbours, signed, options.inliers) for view in (data, model)
     ]
@@ -118,16 +141,8 @@ def candidates(
     i, j = mutually_nearest(described[0].histograms, described[1].histograms, _MATCHES)
     variance = np.full(len(i), 2 * (_SAMPLING_SIGMA * size) ** 2)
     pairs = Pairs(described[0].points[i], described[1].points[j], variance)
-    found = consensus(pairs, options, motions)
-    T = np.array([c.T_target_source for c in found])
-    first, second = described
-    fits = 0.5 * (_fit(first, second, T, size) + _fit(second, first, se3.inverse(T), size))
-    score = fits[0] - VIOLATION_WEIGHT * np.minimum(fits[1], MAX_VIOLATION)
-    score += _SURFACE_WEIGHT * np.log1p(fits[2])
-    score += MATCH_WEIGHT * log_matches([c.score for c in found])
-    best = np.argsort(-score, kind="stable")
-    ranked = tuple(Candidate(T[k], float(fits[0, k]), found[k]) for k in best)
-    return Candidates(size, pairs, ranked, options.sigmas)
+    options = replace(options, distinct_m=_DISTINCT * size, distinct_rad=_DISTINCT_RAD)
+    return MatchedPair(described[0], described[1], size, pairs, options)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +159,16 @@ class DescribedCloud:
         """kd-tree over the points."""
         return KdTree(self.points)
 
+    def thinned(self, count: int) -> DescribedCloud:
+        """Return about as many of the points."""
+        chosen = np.arange(0, len(self.points), max(1, len(self.points) // count))
+        points, normals, histograms = (
+            self.points[chosen],
+            self.normals[chosen],
+            self.histograms[chosen],
+        )
+        return DescribedCloud(points, normals, histograms, self.sphere)
+
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -155,29 +180,38 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
-    """Consensus poses of the matches of two views.
+class MatchedPair:
+    """Two views averaged to the same resolution (m), and all matches of their points."""
 
-    Attributes
-    ----------
-    size
-        Resolution of the averaged views, m.
-    pairs
-        All matches.
-    poses
-        Distinct poses, in order of decreasing fit and matches, less violations of free space.
-    sigmas
-        Maximum distance of a match that agrees, in its standard deviations.
-    """
-
+    source: DescribedCloud
+    target: DescribedCloud
     size: float
     pairs: Pairs
-    poses: tuple[Candidate, ...]
-    sigmas: float
+    options: ConsensusOptions
+
+    def evaluated(self, motions: Float64) -> tuple[Float64, Float64]:
+        """Return the scores (k,) of motions (k, 4, 4), and the fractions of points that fit.
+
+        The score increases with the points, surfaces and matches that fit, and decreases with
+        violations of free space.
+        """
+        back = _fit(self.target, self.source, se3.inverse(motions), self.size)
+        fits = 0.5 * (_fit(self.source, self.target, motions, self.size) + back)
+        score = fits[0] - VIOLATION_WEIGHT * np.minimum(fits[1], MAX_VIOLATION)
+        score += _SURFACE_WEIGHT * np.log1p(fits[2])
+        return score + MATCH_WEIGHT * log_matches(self.matches_at(motions)), fits[0]
 
     def matches_at(self, motions: Float64) -> Float64:
         """Return the MSAC scores (k,) of the matches at motions (k, 4, 4)."""
-        return match_scores(self.pairs, motions, self.sigmas)
+        return match_scores(self.pairs, motions, self.options.sigmas)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Distinct consensus poses of the matches of two views, in order of their scores."""
+
+    pair: MatchedPair
+    poses: tuple[Candidate, ...]
 
 
 def log_matches(score: ArrayLike) -> Float64:
@@ -275,13 +309,23 @@ def fpfh(
 
 def mutually_nearest(a: Float64, b: Float64, count: int = 1) -> tuple[Int64, Int64]:
     """Return the positions in a (n, d) and b (m, d) of rows among the `count` nearest of each."""
-    rows, columns = (np.asarray(x, np.float32) for x in (a, b))
-    distance = (rows**2).sum(1)[:, None] + (columns**2).sum(1) - 2 * (rows @ columns.T)
+    distance = _squared_distances(a, b)
     backward = _smallest(np.ascontiguousarray(distance.T), count)
     forward = _smallest(distance, count)
     mutual = (backward[forward] == np.arange(len(a))[:, None, None]).any(2)
     i, k = np.nonzero(mutual)
     return i.astype(np.int64), forward[i, k].astype(np.int64)
+
+
+def most_similar(a: Float64, b: Float64, count: int) -> Int64:
+    """Return the positions in b (m, d) of the rows nearest to each of a (n, d), (n, count)."""
+    return _smallest(_squared_distances(a, b), count)
+
+
+def _squared_distances(a: Float64, b: Float64) -> Float32:
+    rows, columns = (np.asarray(x, np.float32) for x in (a, b))
+    squared = (rows**2).sum(1)[:, None] + (columns**2).sum(1) - 2 * (rows @ columns.T)
+    return np.asarray(squared, np.float32)
 
 
 def _smallest(distance: Float32, count: int) -> Int64:
@@ -294,6 +338,23 @@ def _smallest(distance: Float32, count: int) -> Int64:
     return columns
 
 
+def fitting(
+    view: DescribedCloud, other: DescribedCloud, T: Float64, reach_m: float
+) -> tuple[Float64, Int64, Float64]:
+    """Return a view's points (k, n, 3) moved by T (k, 4, 4), and what is near them in the other.
+
+    That is the nearest point (k, n) of the other, and the fit (k, n): 1 - (distance / reach)^2
+    where the normals agree, else 0.
+    """
+    points = se3.transform(T, view.points)
+    normals = view.normals @ T[:, :3, :3].transpose(0, 2, 1)
+    nearest, squared = other.tree.nearest(points.reshape(-1, 3), reach_m)
+    nearest, squared = nearest.reshape(points.shape[:2]), squared.reshape(points.shape[:2])
+    cosine = (normals * other.normals[nearest]).sum(2)
+    same_normal = (cosine if other.sphere is not None else np.abs(cosine)) > _MIN_NORMAL_COSINE
+    return points, nearest, np.where(same_normal, np.maximum(1 - squared / reach_m**2, 0), 0)
+
+
 def _fit(view: DescribedCloud, other: DescribedCloud, T: Float64, size: float) -> Float64:
     """Return how well a view fits the other at poses T (k, 4, 4) that map it there, (3, k).
 
@@ -301,18 +362,12 @@ def _fit(view: DescribedCloud, other: DescribedCloud, T: Float64, size: float) -
     the second the fraction of them in the other's free space, the third the number of distinct
     surfaces that fit: the sum of what the first is the mean of, by the shares of the points.
     """
-    chosen = slice(None, None, max(1, len(view.points) // _FIT_POINTS))
-    points = se3.transform(T, view.points[chosen])
-    normals = view.normals[chosen] @ T[:, :3, :3].transpose(0, 2, 1)
-    nearest, squared = other.tree.nearest(points.reshape(-1, 3), _FIT_DISTANCE * size)
-    nearest, squared = nearest.reshape(points.shape[:2]), squared.reshape(points.shape[:2])
-    cosine = (normals * other.normals[nearest]).sum(2)
-    same_normal = (cosine if other.sphere is not None else np.abs(cosine)) > _MIN_NORMAL_COSINE
-    fits = np.where(same_normal, np.maximum(1 - squared / (_FIT_DISTANCE * size) ** 2, 0), 0)
+    chosen = view.thinned(_FIT_POINTS)
+    points, _, fits = fitting(chosen, other, T, _FIT_DISTANCE * size)
     violation = np.zeros(len(T))
     if other.sphere is not None:
         ranges = np.linalg.norm(points - other.sphere.origin, axis=2)
         front = other.sphere.distance_in_front(points.reshape(-1, 3)).reshape(ranges.shape)
         violation = (front > _IN_FRONT * size + _IN_FRONT_RANGE * ranges).mean(1)
-    shares = distinct_surfaces.shares(view.points[chosen], view.normals[chosen], size)
+    shares = distinct_surfaces.shares(chosen.points, chosen.normals, size)
     return np.stack([fits.mean(1), violation, fits @ shares])

@@ -251,7 +251,7 @@ def _ranked(pairs: Pairs, motions: Float64, options: ConsensusOptions) -> list[C
     count, sigmas = len(motions), options.sigmas
     score = match_scores(pairs, motions, sigmas)
     motions = motions[distinct(motions, score, pairs.source, options, _MAX_REFINED)]
-    motions = _refined(pairs, motions, sigmas)
+    motions = refined(pairs, motions, sigmas)
     score = match_scores(pairs, motions, sigmas)
     return [
         Consensus(
@@ -264,7 +264,7 @@ def _ranked(pairs: Pairs, motions: Float64, options: ConsensusOptions) -> list[C
     ]
 
 
-def _refined(pairs: Pairs, motions: Float64, sigmas: float) -> Float64:
+def refined(pairs: Pairs, motions: Float64, sigmas: float) -> Float64:
     """Refine motions (k, 4, 4) by iterated least squares over their inliers."""
     best, best_score = motions.copy(), match_scores(pairs, motions, sigmas)
     for gate in _INLIER_GATES:

@@ -111,7 +111,7 @@ def _matched(source: Frame, target: Frame, scale: float, points: int) -> Iterato
     except RegistrationError:
         return
     for pose in found.poses[:_MAX_POSES]:
-        pairs = found.pairs.select(pose.consensus.inliers)
+        pairs = found.pair.pairs.select(pose.consensus.inliers)
         spread = [np.linalg.norm(x - x.mean(0)) for x in (pairs.source, pairs.target)]
         factor = float(spread[1] / spread[0])
         T = pose.T_target_source.copy()

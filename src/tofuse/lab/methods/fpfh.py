@@ -88,9 +88,9 @@ class Fpfh(Bounded, Registrar):
         )
         best = found.poses[0]
         rival = found.poses[1].inlier_ratio if len(found.poses) > 1 else 0.0
-        coarse = registration_of(found.pairs, best.consensus, best.inlier_ratio - rival)
+        coarse = registration_of(found.pair.pairs, best.consensus, best.inlier_ratio - rival)
         if not self.refine:
             return coarse
-        refinement = CoarseToFine(coarsest=found.size)
+        refinement = CoarseToFine(coarsest=found.pair.size)
         refined = refinement.register(source, target, best.T_target_source, rng)
         return replace(refined, margin=coarse.margin)
