@@ -49,10 +49,9 @@ from tofuse.engine.search import pose_probability
 # Maximum number of points of each averaged view.
 _POINTS = 7_000
 # Number of proposals that are aligned at full resolution, and if none of these is likely.
-_MAX_REFINED, _MANY_REFINED = 3, 12
-_FIRST = 0
+_MAX_REFINED, _MANY_REFINED = 3, 8
 # Points of the source that align a pose.
-_REFINED_POINTS = 2000
+_REFINED_POINTS = 1600
 # Weight of the log of the matches in the rank of a pose, relative to that of its surfaces.
 _MATCH_RANK = 0.5
 # Poses that differ by more resolutions, or rad, are distinct hypotheses.
@@ -162,11 +161,14 @@ class _CloudViews:
     def evaluated(self, T: Float64) -> _Pose:
         return _Pose(T, cloud_agreement(self.source_map, self.target_map, T))
 
-    def refined(self, T: Float64) -> _Pose:
-        """Align with a subset of the averaged source's points; T (4, 4) if that scores lower."""
+    def refined(self, T: Float64, *, settled: bool = False) -> _Pose:
+        """Align with a subset of the averaged source's points; T (4, 4) if that scores lower.
+
+        Proposals have `settled` already.
+        """
         initial = self.evaluated(T)
         try:
-            for icp in _refinement_stages(self.size)[_FIRST:]:
+            for icp in _refinement_stages(self.size)[settled:]:
                 T = icp.register(
                     self.source_map.view, self.target_map.view, T, self.rng
                 ).T_target_source
@@ -311,7 +313,7 @@ def _registered_views(
         poses.append(views.evaluated(image_registration.T_target_source))
     proposed, found = _proposed(views, start, guessed=guess is not None)
     poses += proposed
-    poses += [views.refined(T) for T in _others(views, poses, found)]
+    poses += [views.refined(T, settled=True) for T in _others(views, poses, found)]
     return views.with_information(_best(views, poses, found, local, guess, certain))
 
 
@@ -466,7 +468,7 @@ def _proposed(
     poses, found, failure = [], None, None
     try:
         found = proposals(views.source, views.target, signed=views.has_free_space)
-        poses += [views.refined(T) for T in found.motions[:_MAX_REFINED]]
+        poses += [views.refined(T, settled=True) for T in found.motions[:_MAX_REFINED]]
     except RegistrationError as error:
         failure = error
     supported = any(pose.agreement.support > _MIN_SUPPORT for pose in poses)

@@ -49,7 +49,7 @@ _MAX_ROUGHNESS = 0.6
 # inaccurate).
 _DISTINCT, _DISTINCT_RAD = 4.0, 0.15
 # Points of each view that evaluate a motion, and minimum cosine between normals that fit.
-_FIT_POINTS, _MIN_NORMAL_COSINE = 500, 0.7
+_FIT_POINTS, _MIN_NORMAL_COSINE = 300, 0.7
 # A point violates free space if it lies before the other view's surface by more resolutions, plus
 # this fraction of its range; weight of such points, and the fraction of them that counts.
 _IN_FRONT, _IN_FRONT_RANGE = 2.5, 0.03
