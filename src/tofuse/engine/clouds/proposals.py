@@ -43,7 +43,14 @@ class Proposals:
 
 
 def proposals(source: Frame, target: Frame, *, signed: bool) -> Proposals:
-    """Return poses at which features of two views match; see `fpfh.candidates`.
+    """Return poses at which features of two views match.
+
+    Parameters
+    ----------
+    source, target
+        Views.
+    signed
+        Whether the orientation of the normals is known, from the views' origins.
 
     Raises
     ------
