@@ -52,3 +52,5 @@ def test_free_space_discounts_rivals_of_which_less_coincides(coinciding, counted
     pose = CloudAgreement(0.3, 0.3, 0.0, 0.0, 0.01, 100, 0.3, surfaces=10.0, near_surfaces=20.0)
     rival = replace(pose, surfaces=coinciding, violation=0.05, score=0.3 - 1.0)
     assert cloud_pair._surfaces_of(rival, pose) == pytest.approx(counted)
+    # What free space contradicts by more than counts is none, however much coincides.
+    assert cloud_pair._surfaces_of(replace(rival, violation=0.06), pose) == 0

@@ -27,7 +27,7 @@ from tofuse.engine.clouds.cloud_agreement import (
     cloud_agreement,
 )
 from tofuse.engine.clouds.cloud_uncertainty import cloud_information, cloud_unobservable
-from tofuse.engine.clouds.fpfh import MATCH_WEIGHT, candidates, log_matches
+from tofuse.engine.clouds.fpfh import MATCH_WEIGHT, MAX_VIOLATION, candidates, log_matches
 from tofuse.engine.clouds.proposals import Proposals, proposals
 from tofuse.engine.clouds.repetition import shifts
 from tofuse.engine.clouds.robust_motion import are_distinct
@@ -525,9 +525,10 @@ def _surfaces_of(rival: CloudAgreement, agreement: CloudAgreement) -> float:
     Where a structure repeats, the clouds fit as well one repetition further, only over less of it.
     That less overlaps is no evidence against that pose: its surfaces are counted as if as many were
     near each other. A fraction of few surfaces may be chance, and is taken for a smaller one. Where
-    a smaller fraction coincides, free space counts as well.
+    a smaller fraction coincides, or free space contradicts it beyond doubt, that counts as well.
     """
-    if not _fits_as_well(rival, agreement):
+    is_refuted = rival.violation - agreement.violation > MAX_VIOLATION
+    if is_refuted or not _fits_as_well(rival, agreement):
         return rival.uncontradicted_surfaces
     few = pose_probability.FEW_SURFACES
     nearby = min(rival.near_surfaces, agreement.near_surfaces) + few
