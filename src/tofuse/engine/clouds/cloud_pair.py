@@ -3,7 +3,7 @@
 The clouds are first aligned from the guess. If one is given, and their agreement makes that pose
 practically certain, it is returned; if the clouds are symmetric, so that another pose fits as well,
 it holds given the guess only. Else poses are proposed by feature matching
-(`clouds.fpfh`); each is aligned and evaluated by the agreement of both clouds
+(`clouds.proposals`); each is aligned and evaluated by the agreement of both clouds
 (`clouds.cloud_agreement`) and by its lead over rival poses. That is counted in points, and in
 distinct surfaces, which decide whether the pose is believed. Without a guess rivals are
 searched in any case: however well a symmetric body fits, it fits as well in another pose.
