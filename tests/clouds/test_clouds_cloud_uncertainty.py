@@ -88,6 +88,12 @@ def test_motions_that_patches_leave_open_have_no_information():
     assert information[0, 0] < 1e-2 * information[2, 2]
 
 
+def test_clouds_that_constrain_no_motion_have_no_information():
+    cloud = view(bumpy_ball(2000, 0))
+    information = cloud_information(*maps(cloud, cloud), np.eye(4), np.eye(6))
+    assert np.diag(information).max() < 1e-2
+
+
 def test_clouds_without_overlap_have_no_information():
     cloud = view(bumpy_ball(2000, 0))
     source, target = maps(cloud, CloudFrame.of(cloud.points + np.array([30.0, 0, 0])))

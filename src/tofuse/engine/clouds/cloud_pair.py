@@ -318,9 +318,9 @@ def _registered_views(
 
 
 def _others(views: _CloudViews, poses: list[_Pose], found: Proposals | None) -> Sequence[Float64]:
-    """Return the proposals to align beside the first: all if none of the poses can be likely.
+    """Return the proposals to align beside the first.
 
-    Else only the one that might be the strongest rival of the best, as it is.
+    That is all of them if none of the poses can be likely, else the strongest rival of the best.
     """
     if found is None:
         return []

@@ -235,13 +235,14 @@ def _information(pairs: _Pairs, hessian: Float64, unit: Float64, unobservable: F
     """Return the information (6, 6) about the centroid, degenerate along `unobservable` (k, 6)."""
     constrained = _complement(unobservable, np.eye(6))
     patches = _Patches.of(pairs, unit)
-    if len(patches.residual) >= _MIN_PATCHES:  # these may leave more motions open
+    has_field = len(patches.residual) >= _MIN_PATCHES
+    if has_field and constrained.shape[1]:  # patches may leave more motions open
         _, s, vt = np.linalg.svd(patches.responses @ constrained, full_matrices=False)
         constrained = _complement(vt[s <= _NEGLIGIBLE * s[0]] @ constrained.T, constrained)
     H = (np.eye(6) - constrained @ constrained.T) / (_UNBOUNDED * pairs.size) ** 2
     if not constrained.shape[1]:
         return H
-    if len(patches.residual) >= _MIN_PATCHES:
+    if has_field:
         meat = _posterior_meat(patches, patches.responses @ constrained)
     else:  # too few patches for the field: assume neighbourhoods to be fully correlated
         meat = (

@@ -14,7 +14,13 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.clouds.fpfh import SEEDS, MatchedPair, fitting, matched, most_similar
-from tofuse.engine.clouds.robust_motion import ConsensusOptions, consensus, distinct, refined
+from tofuse.engine.clouds.robust_motion import (
+    ConsensusOptions,
+    consensus,
+    distinct,
+    refined,
+    unlike,
+)
 from tofuse.engine.frames import Frame
 from tofuse.engine.geometry import se3
 
@@ -99,14 +105,11 @@ def _voted(pair: MatchedPair, rotations: Float64) -> Float64:
     return np.concatenate(motions)
 
 
-def _distinct_rotations(rotations: Float64) -> list[Float64]:
-    """Return the rotations (3, 3) that differ from all before them."""
-    flat, chosen = rotations.reshape(-1, 9), list[int]()
+def _distinct_rotations(rotations: Float64) -> Float64:
+    """Return the rotations (m, 3, 3) that differ from all before them."""
+    flat = rotations.reshape(-1, 9)
     alike = flat @ flat.T > 1 + 2 * np.cos(_SAME_RAD)  # traces
-    for k in range(len(rotations)):
-        if not alike[k, chosen].any():
-            chosen.append(k)
-    return list(rotations[chosen])
+    return rotations[unlike(alike, np.arange(len(flat)))]
 
 
 def _peaks(votes: Float64, edge: float) -> Float64:

@@ -226,9 +226,14 @@ def distinct(
     rotations = motions[:, :3, :3].reshape(-1, 9)
     alike = cdist(moved, moved) <= options.distinct_m
     alike &= rotations @ rotations.T >= 1 + 2 * np.cos(options.distinct_rad)  # traces
-    remaining, chosen = np.ones(len(motions), bool), list[int]()
-    for k in np.argsort(-score, kind="stable"):
-        if remaining[k] and len(chosen) < most:
+    return unlike(alike, np.argsort(-score, kind="stable"))[:most]
+
+
+def unlike(alike: Bool, order: Int64) -> Int64:
+    """Return the positions in an order, without those alike (n, n) to one before."""
+    remaining, chosen = np.ones(len(alike), bool), list[int]()
+    for k in order:
+        if remaining[k]:
             chosen.append(int(k))
             remaining &= ~alike[k]
     return np.array(chosen, np.int64)
