@@ -25,6 +25,7 @@ from tofuse.apps.jobs.running import run
 from tofuse.apps.results.run_json import frames_in_main_model, read_run_json
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
+from tofuse.engine.results.verdicts import REASONS
 from tofuse.formats.geometry.ply import read_ply
 from tofuse.formats.poses.trajectory import read_tum
 from tofuse.lab.demo import simulate_to
@@ -158,9 +159,10 @@ def lines(exhibit: Exhibit, result: Path, truth: Path) -> Iterator[str]:
         f" pose; error against the ground truth {1000 * error.ate_rms_m:.1f} mm and"
         f" {np.degrees(error.rotation_rms_rad):.2f} degrees."
     )
-    if run_json["reasons"]:
-        yield "\nReasons of the verdict, and notes:\n"
-        yield from (f"- `{r['code']}`: {r['text']}" for r in run_json["reasons"])
+    reasons = [r for r in run_json["reasons"] if REASONS[r["code"]][0] != "note"]
+    if reasons:
+        yield "\nReasons of the verdict:\n"
+        yield from (f"- `{r['code']}`: {r['text']}" for r in reasons)
     yield ""
 
 

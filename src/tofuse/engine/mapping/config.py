@@ -82,8 +82,7 @@ class Config(Bounded):
         A result is good if the 95 % bound of the poses' rms error is within it, m; None for 0.5 %
         of the model's diagonal, at least 1 cm.
     memory_mb
-        Approximate memory of a run; see `voxels_mb`, `checked_bytes` and `views_bytes`. Data that
-        does not fit is stored on disk.
+        Approximate memory of a run; data that does not fit is stored on disk.
     """
 
     method: str
