@@ -266,6 +266,7 @@ def test_every_command_and_option_is_listed() -> None:
     table = reference.table("command run")
     assert "| `--memory SIZE` | approximate memory limit" in table
     assert "| `--overwrite` |" in table
+    assert "| `--set NAME=VALUE` |" in reference.table("command record")
     assert "0.5 % of the model" in table
 
 

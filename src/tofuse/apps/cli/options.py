@@ -58,7 +58,7 @@ class Seed(Command):
     Attributes
     ----------
     seed : N
-        random seed (0)
+        random seed (default: 0)
     """
 
     seed: NonNegative | None = None
@@ -82,9 +82,9 @@ class Written(Command):
     Attributes
     ----------
     out : DIR
-        folder for the result (none)
+        folder for the result (default: only print)
     overwrite
-        replace an existing one in --out
+        replace an existing result in --out
     """
 
     out: Path | None = None
@@ -97,7 +97,7 @@ class Edited(Command):
     Attributes
     ----------
     edited
-        read results although their files were changed by hand
+        accept results whose files were edited
     """
 
     edited: bool = False
@@ -123,9 +123,9 @@ class Source(Command):
     format : F
         input format, if not recognised
     camera : FILE
-        camera.json to use instead of the recording's own, or lens by OpenCV, ROS, ...
+        camera.json, or a calibration file of OpenCV, ROS, ..., instead of the recording's own
     topic : T
-        topic of a ROS bag, if the default is wrong
+        topic of a ROS bag, or stream of a .h5 file (default: chosen automatically)
     """
 
     format: str | None = None
@@ -139,8 +139,7 @@ class Scaled(Source):
     Input
     -----
     factor : F
-        multiply the depth of images, or the points and poses of clouds, by F, such as 0.001 for mm
-        read as m
+        multiply depth, or the points and poses of clouds, by F, such as 0.001 if they are in mm
     """
 
     factor: Factor | None = None
@@ -152,7 +151,7 @@ class Selection(Scaled):
     Input
     -----
     start : I
-        first frame (0)
+        first frame (default: 0)
     end : I
         stop before this frame
     every : N
@@ -170,7 +169,7 @@ class Page(Command):
     Browser
     -------
     port : N
-        port (8080, or the next free one)
+        port (default: 8080, or the next free one)
     no_open
         do not open the browser
     """
@@ -193,37 +192,37 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
     no_report
         don't draw report.html, which takes up to half of a short run
     share
-        write share.html and share.usdz as well: the model alone, to send and to show in a room
+        also write share.html and share.usdz: the model alone, to send and for AR
     mirrors
         find mirrors, and cut the rooms behind them out of the model (experimental)
     texture
-        texture the surface in mesh.glb and in the report, of colour images or else of amplitudes
+        texture the surface in mesh.glb and in the report, from colour images or else amplitudes
         (default: if there are enough colour images)
     faces : N
         maximum number of triangles (default: all)
     voxel : LENGTH
         resolution of the model, e.g. 5mm (default: from the camera's resolution)
     memory : SIZE
-        approximate memory limit, e.g. 4GB; the rest goes to disk (2GB)
+        approximate memory limit, e.g. 4GB; the rest goes to disk (default: 2GB)
     rig : FILE
         a rig.json; each INPUT is one of its cameras, in the same order
     profile
-        print how long each stage took, from the start of the process to its end
+        print how long each stage of the process took
 
     Reconstruction
     --------------
     method : NAME
-        default, thesis (default: default)
+        configuration: default or thesis (default: default)
     config : FILE
         options from a .toml file, or from the run.json of an earlier result
     guess
-        initial guess of each registration
+        initial guess of each registration (default: previous)
     moving
-        exclude what moves from tracking and model (default), or ignore that anything may: for a
-        scene that is static for certain
+        exclude moving objects from tracking and model (default), or ignore that anything may move,
+        in a scene that is certainly static
     prior
-        priors in addition to the images, as far as they agree: gravity and a phone's own poses
-        (auto, the default), none, or odometry as well (device)
+        measurements to use, as far as they agree with the images: gravity and a phone's own poses
+        (auto, the default), none, or recorded odometry as well (device)
     loops : FILE
         known loop closures, one `i j` per line
     object
@@ -231,7 +230,7 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
     unwrap
         unwrap phase beyond the camera's ambiguity range
     tolerance : LENGTH
-        accuracy required of a "good" result, e.g. 30mm (0.5 % of the model, at least 10mm)
+        accuracy required of a "good" result, e.g. 30mm (default: 0.5 % of the model, at least 10mm)
 
     Browser
     -------
@@ -308,13 +307,13 @@ class Batch(Command):
     Workers
     -------
     workers : N
-        parallel jobs on this machine (1)
+        parallel jobs on this machine (default: 1)
     scheduler : ADDRESS
         Dask scheduler: tcp://HOST:8786, or its scheduler file
     threads : N
         threads per job (default: all cores shared by the jobs; on Dask: 1)
     retries : N
-        how often a job whose process was killed is restarted (3)
+        how often a job whose process was killed is restarted (default: 3)
 
     Exit status
     -----------
@@ -351,15 +350,15 @@ class Register(Written, Json, Threads, Source):
     target : TARGET
         the view that stays fixed
     guess : FILE
-        initial guess of T_target_source (none)
+        initial guess of T_target_source
     method : NAME
-        registration method, such as icp (any-pair)
+        registration method, such as icp (default: any-pair)
     scale
-        the source is of unknown scale, as models from images alone are
+        estimate the unknown scale of the source, as of a model from images alone
     factor : F
         multiply the source's coordinates by F, such as 0.001 for a file in mm
     risk : P
-        probability with which an accepted pose may be wrong, up to 0.1 (0.1)
+        largest probability that an accepted pose is wrong, up to 0.1 (default: 0.1)
 
     Exit status
     -----------
@@ -387,11 +386,11 @@ class Judge(Written, Json, Threads, Selection):
     trajectory : TRAJECTORY
         a trajectory in any supported format, a result, or a recording with poses
     out : DIR
-        folder for the refined result (none)
+        folder for the refined result (default: only print)
     tolerance : LENGTH
-        accuracy required of good poses, e.g. 30mm (0.5 % of the model, at least 10mm)
+        accuracy required of good poses, e.g. 30mm (default: 0.5 % of the model, at least 10mm)
     scale
-        the poses are of unknown scale: estimate it from the depth (only if they can't be in metres)
+        estimate the scale of the poses from the depth (default: only if they can't be in metres)
 
     Exit status
     -----------
@@ -462,7 +461,7 @@ class Locate(Written, Json, Threads, Edited, Selection):
     input : INPUT
         what is to be located
     out : DIR
-        folder for the poses (none)
+        folder for the poses (default: only print)
 
     Exit status
     -----------
@@ -481,29 +480,29 @@ class Compare(Written, Json, Threads, Edited):
     """Compare a result with a CAD model, a mesh, a cloud or another result.
 
     Both are registered, and the result's deviation from the reference's surface is mapped, with its
-    uncertainty. A tolerance is decided as ISO 14253-1 says.
+    uncertainty. The tolerance is decided by the rules of ISO 14253-1.
 
     Attributes
     ----------
     result : RESULT
         a result, or a mesh or cloud (PLY, STL, OBJ, GLB, E57, ...)
     reference : REFERENCE
-        what it should be: the same
+        what it should be: a file or result of the same kinds
     tolerance : LENGTH
-        largest deviation allowed, to either side, e.g. 2mm (none)
+        largest deviation allowed, to either side, e.g. 2mm
     accuracy : LENGTH
         95 % bound on errors that neighbouring points share (default: as the result states)
     guess : FILE
-        initial guess of T_reference_result (none)
+        initial guess of T_reference_result
     unit
         unit of the reference's file (default: m or mm, by its extent)
     out : DIR
-        folder for the map of deviations and the report (none)
+        folder for the map of deviations and the report (default: only print)
 
     Exit status
     -----------
-    0  all that was seen is within the tolerance, or there is none
-    3  something is not
+    0  everything seen is within the tolerance, or no tolerance was given
+    3  something is outside the tolerance
     4  undecided: too close to the tolerance, or the registration is not accepted
     2  nothing was written: one line on stderr states the reason
     """
@@ -528,7 +527,7 @@ class Repeat(Written, Json, Threads, Edited):
     results : RESULT
         two or more results; the first one is the reference
     out : DIR
-        folder for the tables (none)
+        folder for the tables (default: only print)
 
     Exit status
     -----------
@@ -542,14 +541,14 @@ class Repeat(Written, Json, Threads, Edited):
 
 
 class Card(Written, Json, Edited):
-    """Collect what results of one camera say about it, and whether it drifts.
+    """Follow one camera over its results, and test whether it drifts.
 
     Attributes
     ----------
     results : RESULT
         results of one camera; their recordings must still be at their paths
     out : DIR
-        folder for card.html and card.json (none)
+        folder for card.html and card.json (default: only print)
 
     Exit status
     -----------
@@ -646,16 +645,16 @@ class Demo(JsonLines, Seed, Threads):
     Attributes
     ----------
     scene
-        what to simulate (room)
+        what to simulate (default: room)
     failure
         simulate a recording that can't be reconstructed, 1.5 m along a bare corridor: report.html
         shows how the failure is detected and explained
     out : DIR
-        output folder (tofuse-demo)
+        output folder (default: tofuse-demo)
     overwrite
         replace an existing demo in DIR
     method : NAME
-        default, thesis (default: default)
+        configuration: default or thesis (default: default)
 
     Exit status
     -----------
@@ -686,9 +685,9 @@ class Simulate(Seed, Threads):
     out : DIR
         output folder
     camera : NAME
-        camera model, or `phone` (sr4000)
+        camera model, or `phone` (default: sr4000)
     every : N
-        stride (default: the thesis's; 6 for a phone)
+        use every N-th raw frame (default: as in the thesis; 6 for a phone)
     frames : N
         stop after this many frames
     first : K
@@ -708,7 +707,7 @@ class Simulate(Seed, Threads):
     imu
         simulate an accelerometer as well
     sigma : M
-        noise of the `peaks` scene (0.05)
+        noise of the `peaks` scene, m (default: 0.05)
     """
 
     home = _LAB
@@ -731,7 +730,7 @@ class Simulate(Seed, Threads):
 
 
 class Plan(Json, Seed, Threads, Edited):
-    """Say what cameras would achieve in a place, from a coarse scan of it.
+    """Predict which cameras would reach a tolerance, from a coarse scan of the place.
 
     Each camera is simulated along the path in the scan's model, and what it records is
     reconstructed.
@@ -745,11 +744,11 @@ class Plan(Json, Seed, Threads, Edited):
     path : FILE
         trajectory in the world of the scan (default: its own)
     tolerance : LENGTH
-        required 95 % bound on the positions of the camera (5mm)
+        required 95 % bound on the positions of the camera (default: 5mm)
 
     Exit status
     -----------
-    0  some camera would do
+    0  some camera would reach the tolerance
     3  none would
     4  undecided: too close to the tolerance
     2  nothing was simulated: one line on stderr states the reason
@@ -792,7 +791,7 @@ class Convert(Selection):
     out : DIR
         a new folder
     to
-        layout of the folder (native; the others cannot store everything)
+        layout of the folder (default: native; the others cannot store everything)
     """
 
     inputs: list[str]
@@ -816,7 +815,7 @@ class Record(Page):
     set : NAME=VALUE
         camera option, e.g. serial=1234; may be repeated
     view
-        map the frames meanwhile, and show the map and where to look next
+        show a map of the frames so far, and where to look next
     """
 
     device: str | None
@@ -832,7 +831,7 @@ class Calibrate(Json, Seed, Selection):
 
     lens: from views of a checkerboard, writes a camera.json.
     depth: from views of planes, writes a correction.npz.
-    import: from a file of OpenCV or of ROS (YAML), writes a camera.json.
+    import: from a file of OpenCV, ROS, Kalibr, Open3D or ORB-SLAM, writes a camera.json.
 
     Attributes
     ----------
@@ -841,7 +840,7 @@ class Calibrate(Json, Seed, Selection):
     inputs : INPUT
         recordings; import: one file
     out : FILE
-        write the result
+        file for the result (default: only print)
     overwrite
         replace an existing FILE
 
@@ -850,19 +849,19 @@ class Calibrate(Json, Seed, Selection):
     board : CxR:M
         inner corners and square size in metres, e.g. 8x6:0.1
     image
-        image in which to detect the board (amplitude)
+        image in which to detect the board (default: amplitude)
 
     Depth
     -----
     wall
         the board is flat on a wall; use the whole wall
     planes : N
-        without --board: maximum planes per view (4)
+        without --board: maximum planes per view (default: 4)
 
     Lens
     ----
     model
-        distortion model (brown)
+        distortion model (default: brown)
 
     Import
     ------
@@ -892,7 +891,7 @@ class Noise(Json, Scaled):
     inputs : INPUT
         recordings, joined in this order
     out : FILE
-        write the noise model, e.g. noise.json
+        file for the noise model, e.g. noise.json (default: only print)
     overwrite
         replace an existing FILE
     name : NAME
@@ -938,10 +937,10 @@ class Optimize(Json):
     out : OUT.g2o
         the optimised pose graph
     optimiser : NAME
-        levenberg-marquardt (the default), castellani, lu-milios, elch or stochastic
+        castellani, lu-milios, elch, stochastic or levenberg-marquardt (the default)
     robust : KERNEL
-        reject false loops, of levenberg-marquardt: truncated, huber, cauchy, geman-mcclure, dcs or
-        switchable (default: none, plain least squares)
+        against false loops, for levenberg-marquardt: truncated, huber, cauchy, geman-mcclure, dcs
+        or switchable (default: none, plain least squares)
     overwrite
         replace an existing OUT.g2o
     """
@@ -966,7 +965,7 @@ class Export(Edited):
     out : DIR
         folder for the files (default: that of the result)
     faces : N
-        maximum number of triangles (60000; STL: all)
+        maximum number of triangles (default: 60000; STL: all)
     every : N
         every N-th frame (nerfstudio, colmap, rerun, mcap, occupancy, esdf, octomap)
     pinhole
@@ -999,7 +998,7 @@ class Experiments(Seed, Threads):
     cases : NAMES
         run only these, separated by commas
     seeds : N
-        noise seeds (20)
+        noise seeds (default: 20)
     """
 
     home = _LAB

@@ -219,7 +219,7 @@ def _add_options(parser: argparse.ArgumentParser, command: type[Command]) -> Non
                     containers[command] = container.add_mutually_exclusive_group()
                 container = containers[command]
             option, settings = _settings(name, hint, vars(base))
-            if "action" not in settings:
+            if settings.get("action", "append") == "append":
                 settings["metavar"] = metavar
             container.add_argument(option, help=help_text, **settings)
 
