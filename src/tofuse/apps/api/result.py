@@ -87,7 +87,7 @@ class Result(Reconstruction):
 
     @property
     def accuracy(self) -> str:
-        """The accuracy card, in one line."""
+        """The accuracy in one line: bound, coverage, least certain frame, advice."""
         return accuracy_card.SEPARATOR.join(accuracy_card.card(self))
 
     @signals_as_themselves()
@@ -106,7 +106,7 @@ class Result(Reconstruction):
         Raises
         ------
         InputError
-            If the trajectory was changed and is none.
+            If the trajectory was replaced by what is not a trajectory.
         OutputError
             If the folder contains anything but a result, or a result and `overwrite` is not set.
         """
@@ -400,7 +400,7 @@ def merge(
 
     Returns
     -------
-    A result as of a run, with `sessions` and `session_pairs`. Sessions that can't be joined to the
+    A result like that of a run, with `sessions` and `session_pairs`. Sessions that can't be joined to the
     first one are components with their own models.
 
     Raises

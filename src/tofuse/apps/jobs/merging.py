@@ -79,7 +79,7 @@ def merge(
 
     Returns
     -------
-    A result as of a run, with `sessions` and `session_pairs`. Sessions that can't be joined to the
+    A result like that of a run, with `sessions` and `session_pairs`. Sessions that can't be joined to the
     first one are components with their own models.
 
     Raises

@@ -68,8 +68,8 @@ def register(
         that of equal extents, and `scale_sigma` its standard deviation; seconds. Or that factor, if
         it is known, such as 0.001 for a source in mm.
     risk
-        Largest probability, up to 0.1, with which a pose that is `believed` may be wrong. As most
-        are nearly certain, a hundredth of those with less than 0.1 is expected to be wrong.
+        Largest probability, up to 0.1, that a `believed` pose is wrong. As most are nearly
+        certain, a hundredth of all is expected to be wrong with 0.1.
     seed
         Seed of the random selection of points, for methods that use one.
 

@@ -81,7 +81,7 @@ class RangeFrame:
         "raw": the received modulated light, which decreases with the square of the range;
         "range_compensated": multiplied by the square of the range (and divided by the falloff of
         lens and illumination), which is the albedo times the cosine of incidence; "ir": active
-        brightness by the maker's own mapping, treated as raw.
+        brightness by the manufacturer's own mapping, treated as raw.
     ambiguity_m
         Range in m after which the phase repeats; None if not known.
     color_registered

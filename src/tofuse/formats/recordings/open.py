@@ -114,8 +114,8 @@ def open_recording(
     paths
         Files, folders or .zip files of these; several are joined in the order given. A folder of
         native or SR4000 recordings is joined in name order; if it contains a rig.json, its
-        recordings are the cameras of a rig, one image of each in turn. A folder with a single
-        recording or folder in it stands for that.
+        recordings are the cameras of a rig, one image of each in turn. A folder that
+        contains a single recording or folder stands for it.
     format
         Name of a reader, instead of detection.
     camera
