@@ -79,8 +79,8 @@ def merge(
 
     Returns
     -------
-    A result like that of a run, with `sessions` and `session_pairs`. Sessions that can't be joined to the
-    first one are components with their own models.
+    A result like that of a run, with `sessions` and `session_pairs`. Sessions that can't be joined
+    to the first one are components with their own models.
 
     Raises
     ------
