@@ -295,7 +295,7 @@ def test_troubleshooting_explains_every_reason_below_its_verdict() -> None:
 @pytest.mark.nightly
 def test_every_field_of_json_is_documented(short_recording: Path) -> None:
     data = run_json(tofuse.reconstruct(tofuse.open(short_recording)))
-    page = codes(reference.filled(text_of("docs/commands.md")))
+    page = codes(reference.filled(text_of("docs/commands.md") + text_of("docs/results.md")))
     found = {*data, *data["input"], *data["accuracy"], *data["frames"][0]}
     found |= {"code", "frames", "ranges", "text", "removed"}
     pair = pair_json(register_files(f"{short_recording}#1", f"{short_recording}#0"))
