@@ -159,8 +159,10 @@ def _run_live(arguments: cli.Run) -> int:
     from tofuse.apps.viewer import LiveView, address, serve, stop
     from tofuse.engine.progress import CombinedProgress
 
-    if arguments.profile:
-        raise InputError("can't be used with --view", where="--profile", remedy="leave one out")
+    for name in ("profile", "no_report"):
+        if getattr(arguments, name):
+            option = f"--{name.replace('_', '-')}"
+            raise InputError("can't be used with --view", where=option, remedy="leave one out")
     options = run_options(arguments)
     folders.check_output(arguments.out, overwrite=arguments.overwrite)  # before a browser opens
     server = serve(arguments.port)

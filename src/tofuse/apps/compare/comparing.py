@@ -13,7 +13,14 @@ from numpy.typing import ArrayLike
 from tofuse._version import __version__
 from tofuse.apps.compare.deviations import COVERAGE, DeviationMap, Places, fitted, mapped
 from tofuse.apps.compare.nearest import Reach, Reference, measured_points
-from tofuse.apps.compare.surface import Comparable, Surface, in_metres, spacing_of, surface_of
+from tofuse.apps.compare.surface import (
+    UNITS_M,
+    Comparable,
+    Surface,
+    in_metres,
+    spacing_of,
+    surface_of,
+)
 from tofuse.apps.pairs import PairResult, pair_words, register
 from tofuse.apps.report import scene
 from tofuse.apps.results import run_json
@@ -43,6 +50,7 @@ _TURNED_SHARE = 0.8
 _NEARER = 0.5  # distance from the guess to a pose, relative to that to a rival which it excludes
 _MAX_RIVAL = 0.9  # fraction of the points of a pose that a rival may explain, to be excluded
 _MAX_FITTED = 0.3  # by which a fit changes a symmetry, as a fraction of it
+_LENGTHS_M = Bounds(1e-9, se3.MAX_COORDINATE_M)  # of a tolerance: their squares are numbers
 _SLIDE = 0.02  # along a direction that is not determined, as a fraction of the diagonal
 
 
@@ -309,7 +317,9 @@ def compare(
     start = None if guess is None else se3.check_pose(guess, where="guess")
     for value, where in ((tolerance_m, "tolerance_m"), (accuracy_m, "accuracy_m")):
         if value is not None:
-            check_number(value, Bounds(0, exclusive=True), where)
+            check_number(value, _LENGTHS_M, where)
+    if unit is not None and (not isinstance(unit, str) or unit not in UNITS_M):
+        raise InputError(f"is {unit!r}", where="unit", remedy=f"use one of {', '.join(UNITS_M)}")
     measured, nominal, said = in_metres(surface_of(result), surface_of(reference), unit)
     if accuracy_m is not None:
         measured = replace(measured, shared_m=accuracy_m / OF_95_PERCENT)

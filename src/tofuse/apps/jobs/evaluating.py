@@ -104,7 +104,7 @@ def evaluate(
     """
     if reference_error_m is not None:
         check_number(reference_error_m, Bounds(0), "reference_error_m")
-    if isinstance(recording, str | Path):
+    if recording is not None and not isinstance(recording, Recording):
         recording = open_recording(recording)
     names = [
         str(source) if isinstance(source, str | Path) else name

@@ -33,7 +33,7 @@ from tofuse.engine.frames import Frame, Recording, Source, evenly_spaced, frame_
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import Config, adaptation, clips, from_method, reconstructing
 from tofuse.engine.parts import check_number
-from tofuse.engine.progress import Progress, Silent
+from tofuse.engine.progress import Progress, receiver
 from tofuse.engine.quality import (
     cross_view_agreement,
     map_agreement,
@@ -193,9 +193,9 @@ def judge(
         If fewer than two frames have a pose, or the recording contains clouds; if the scale is
         unknown and can't be estimated.
     """
-    progress = progress or Silent()
+    progress = receiver(progress)
     if tolerance_m is not None:
-        check_number(tolerance_m, Bounds(0, exclusive=True), "tolerance_m")
+        tolerance_m = check_number(tolerance_m, Bounds(0, exclusive=True), "tolerance_m")
     if not isinstance(recording, Recording):
         recording = open_recording(recording)
     check_one_camera(recording)
