@@ -245,5 +245,6 @@ def _timed(
             f"holds {quantities.count(len(timed.poses), 'pose')}, and the recording "
             f"{quantities.count(len(clock[0]), 'frame')}",
             where=name,
+            remedy="pass one for each frame, NaN where there is none",
         )
     return clock[0], timed.poses

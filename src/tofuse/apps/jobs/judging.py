@@ -124,7 +124,10 @@ class Judgement:
 
     @cached_property
     def refined(self) -> Reconstruction:
-        """The result of all frames, as a run makes it; computed when it is first used."""
+        """The result of all frames, as a run makes it; computed when it is first used.
+
+        Where it began with the poses, it is of the frames that have one.
+        """
         return self._reconstruct()
 
     def __repr__(self) -> str:
@@ -257,9 +260,12 @@ def judge(
     )
 
     def reconstruct() -> Reconstruction:
-        started = refined.started
-        source = adaptation.with_odometry(recording, poses) if started else recording
-        config_used = replace(given_config, refinement=config.refinement) if started else config
+        source, config_used = recording, config
+        if refined.started:
+            # Frames to which no pose was given are not lost.
+            posed = recording.indices[np.isfinite(poses).all((1, 2))]
+            source = replace(adaptation.with_odometry(recording, poses), indices=posed)
+            config_used = replace(given_config, refinement=config.refinement)
         return reconstructing.reconstruct(source, config_used, threads=threads, progress=progress)
 
     return Judgement(

@@ -297,7 +297,7 @@ def _resolve(
         raise InputError(
             f"could be several formats ({evidence})",
             where=path,
-            remedy=f"use --format {' or '.join(confident)}",
+            remedy=f"use --format {' or '.join(confident)}, or pass its files, which are joined",
         )
     if not sniffs and (parts := _recordings_in(path, options)):
         return parts
