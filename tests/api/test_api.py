@@ -465,7 +465,6 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: tofuse.evaluate(result, arrays[2], recording=3.0), "path: is a float"),
         (lambda: result.view(port="a", open_browser=False), "port: is 'a'"),
         (lambda: tofuse.compare(result, result, unit="feet"), "unit: is 'feet'; use one of mm"),
-        (lambda: tofuse.compare(result, result, accuracy_m=1e300), r"accuracy_m: is 1e\+300"),
         (lambda: tofuse.judge(tmp_path, arrays[2]), "is an empty folder"),
         (lambda: tofuse.judge(recording, arrays[2], threads=0), "threads: is 0"),
         (lambda: tofuse.reconstruct(recording, threads=0), "threads: is 0"),

@@ -50,7 +50,6 @@ _TURNED_SHARE = 0.8
 _NEARER = 0.5  # distance from the guess to a pose, relative to that to a rival which it excludes
 _MAX_RIVAL = 0.9  # fraction of the points of a pose that a rival may explain, to be excluded
 _MAX_FITTED = 0.3  # by which a fit changes a symmetry, as a fraction of it
-_LENGTHS_M = Bounds(1e-9, se3.MAX_COORDINATE_M)  # of a tolerance: their squares are numbers
 _SLIDE = 0.02  # along a direction that is not determined, as a fraction of the diagonal
 
 
@@ -317,7 +316,7 @@ def compare(
     start = None if guess is None else se3.check_pose(guess, where="guess")
     for value, where in ((tolerance_m, "tolerance_m"), (accuracy_m, "accuracy_m")):
         if value is not None:
-            check_number(value, _LENGTHS_M, where)
+            check_number(value, Bounds(0, exclusive=True), where)
     if unit is not None and (not isinstance(unit, str) or unit not in UNITS_M):
         raise InputError(f"is {unit!r}", where="unit", remedy=f"use one of {', '.join(UNITS_M)}")
     measured, nominal, said = in_metres(surface_of(result), surface_of(reference), unit)
@@ -344,8 +343,7 @@ def compared(
         T = registration.T_target_source
     reference = _facing_alike(measured, reference, T)
     T, free = fitted(measured, reference, T, reach, tolerance_m)
-    shared = [measured.shared_m, reference.surface.shared_m]
-    shared_m = float(np.sqrt(sum((s or 0.0) ** 2 for s in shared)))
+    shared_m = float(np.hypot(measured.shared_m or 0.0, reference.surface.shared_m or 0.0))
     deviations = mapped(measured, reference, T, reach, tolerance_m, shared_m, free)
     if not len(deviations.places.deviation):
         why = "; ".join(filter(None, (said, reason)))
