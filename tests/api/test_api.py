@@ -356,12 +356,19 @@ def test_slow_cameras_and_parts_of_images_are_accepted(arrays, times):
         ({"timestamp": 1e300}, "timestamp"),
         ({"index": 2**63}, "index"),
         ({"camera": None}, "camera"),
+        ({"depth_kind": np.ones(3)}, r"depth_kind: .*use one of z, range"),
+        ({"ambiguity_m": "5"}, "ambiguity_m: is '5'"),
+        ({"ambiguity_m": 0}, "ambiguity_m: is 0"),
+        ({"sigma_image": np.full((60, 80), 3)}, "sigma_image: is int64; use floats in metres"),
         ({"depth": [[1.0]]}, "depth"),
         ({"depth": np.ones(60)}, "depth"),
         ({"amplitude_image": "x"}, "amplitude_image"),
         ({"depth": np.full((60, 80), 1500, np.uint16)}, "depth: is uint16; use floats in metres"),
         ({"color_image": np.ones((60, 80, 3))}, "color_image: is float64; use uint8"),
-        ({"color_image": np.ones((60, 80, 4), np.uint8)}, r"color_image: .*shape \(60, 80, 4\)"),
+        (
+            {"color_image": np.ones((60, 80, 4), np.uint8)},
+            r"color_image: .*shape \(60, 80, 4\); .*\(H, W, 3\)",
+        ),
         ({"confidence_image": np.ones((60, 80), bool)}, "confidence_image: is bool; use uint8"),
     ],
 )
@@ -379,6 +386,31 @@ def test_masked_pixels_have_no_value(arrays) -> None:
     assert frame.valid[:, 1::2].all()
     assert not frame.valid[:, ::2].any()
     assert not frame.amplitude_image[:, ::2].any()
+
+
+def test_points_that_are_masked_or_nan_are_none() -> None:
+    points = np.ma.masked_array(np.random.default_rng(0).normal(size=(40, 3)))
+    points[:20] += 50
+    points[:20] = np.ma.masked
+    points[20] = np.nan
+    amplitude = np.arange(40.0, dtype=np.float32)
+    for frame in (
+        tofuse.CloudFrame.of(points, amplitude=amplitude),
+        tofuse.CloudFrame(0, 0.0, points, amplitude=amplitude),
+    ):
+        assert frame.points.dtype == np.float32
+        np.testing.assert_array_equal(frame.points, points.data[21:].astype(np.float32))
+        np.testing.assert_array_equal(frame.amplitude, amplitude[21:])
+    with pytest.raises(InputError, match="source: has 0 finite points"):
+        tofuse.register(np.ma.masked_all((40, 3)), points.data)
+
+
+def test_numbers_of_numpy_are_options(arrays) -> None:
+    options = {"fusion": {"voxel_m": np.float32(0.0625)}, "tolerance_m": np.float16(0.5)}
+    mapper = tofuse.Mapper(options)
+    assert (mapper.config.fusion.voxel_m, mapper.config.tolerance_m) == (0.0625, 0.5)
+    recording = tofuse.from_arrays(*arrays[:2])
+    assert tofuse.judge(recording, arrays[2], tolerance_m=np.float32(0.5)).verdict == "good"
 
 
 def test_negative_depth_is_refused_unless_it_marks_pixels(arrays) -> None:
@@ -412,6 +444,8 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: tofuse.Mapper(threads=0), "threads: is 0"),
         (lambda: tofuse.advise(None), "source: is a NoneType"),
         (lambda: tofuse.open(tmp_path, min_depth="1m"), "min_depth: is '1m'"),
+        (lambda: tofuse.open(tmp_path, min_depth=10**400), "min_depth: is 1000"),
+        (lambda: tofuse.open(tmp_path, tmp_path / "."), "is given twice; pass each recording"),
         (lambda: tofuse.load(None), "folder: "),
         (lambda: result.save(None), "folder: "),
         (lambda: result.mesh.save(None), r"path: is a NoneType.*ends in one of \.glb"),
@@ -426,6 +460,11 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: result.evaluate(arrays[2], reference_error_m=-1), "reference_error_m: is -1"),
         (lambda: tofuse.judge(recording, arrays[2], tolerance_m=-1), "tolerance_m: is -1"),
         (lambda: tofuse.judge(arrays[0], arrays[2]), "path: is an ndarray"),
+        (lambda: tofuse.judge(recording, arrays[2], progress=True), "progress: is True"),
+        (lambda: result.evaluate(arrays[2][:2]), "^reference: holds 2 poses"),
+        (lambda: tofuse.evaluate(result, arrays[2], recording=3.0), "path: is a float"),
+        (lambda: result.view(port="a", open_browser=False), "port: is 'a'"),
+        (lambda: tofuse.compare(result, result, unit="feet"), "unit: is 'feet'; use one of mm"),
         (lambda: tofuse.judge(tmp_path, arrays[2]), "is an empty folder"),
         (lambda: tofuse.judge(recording, arrays[2], threads=0), "threads: is 0"),
         (lambda: tofuse.reconstruct(recording, threads=0), "threads: is 0"),
@@ -440,7 +479,10 @@ def test_wrong_arguments_are_named(arrays, result, tmp_path):
         (lambda: tofuse.reconstruct(recording, loops=[(0, 6)]), "loops: there is no frame 6"),
         (lambda: tofuse.compare(result, result, tolerance_m="2mm"), "tolerance_m: is '2mm'"),
         (lambda: result.distance(None, [0, 0, 0]), "are not two different points"),
-        (lambda: tofuse.register(*recording[:2], guess="eye"), "guess: is not a matrix"),
+        (
+            lambda: tofuse.register(*recording[:2], guess="eye"),
+            "guess: is not a matrix.*; use a rigid motion",
+        ),
         (lambda: tofuse.CloudFrame(0, 0.0, far.tolist()), "frame 0: points have type list"),
         (lambda: tofuse.CloudFrame(0, 0.0, far), r"coordinates up to 1e\+20"),
         (lambda: cloud(origin=np.full(3, np.nan)), "frame 0: origin"),

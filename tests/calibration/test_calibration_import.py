@@ -43,6 +43,11 @@ def test_import_command(
     assert about.amplitude_kind == "range_compensated"
     assert main(command) == 2
     assert "--overwrite" in capsys.readouterr().err
+    # What the file that is replaced says of the images was lost: depth of 0.1 mm became 1 mm.
+    assert main([*command, "--overwrite"]) == 0
+    kept = load_camera(out)[0]
+    assert (kept.depth_unit_m, kept.amplitude_kind) == (0.0001, "range_compensated")
+    assert (kept.frame_rate_hz, kept.sensor) == (about.frame_rate_hz, about.sensor)
     other = tmp_path / "camera.json"
     assert main(["calibrate", "import", str(source), "--out", str(other)]) == 0
     assert load_camera(other)[0].depth_unit_m == 0.001

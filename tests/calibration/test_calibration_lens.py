@@ -111,8 +111,8 @@ def _bare(frame: RangeFrame) -> RangeFrame:
         (lambda: frames()[:3], BOARD, "3 distinct viewpoints"),
         (lambda: frames()[:1] * 6, BOARD, "1 distinct viewpoints"),
         (lambda: frames()[:4], Board(9, 7, 0.1), "shows no board of 9 x 7"),
-        (lambda: frames()[:4], Board(5, 4, 0.1), "check board"),
-        (lambda: [_bare(frames()[0])], BOARD, "use image color"),
+        (lambda: frames()[:4], Board(5, 4, 0.1), "check --board"),
+        (lambda: [_bare(frames()[0])], BOARD, "use --image color"),
         (lambda: [CloudFrame.of(np.eye(3))], BOARD, "contains clouds"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from argparse import ArgumentTypeError
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,12 @@ from typing import Any
 import pytest
 
 from cli_calls import refuses
+from tofuse import __version__
 from tofuse.apps.cli.commands import run_options
 from tofuse.apps.cli.parser import make_parser
 from tofuse.apps.cli.values import _size
 from tofuse.apps.jobs.run_options import Options, resolve, seed_of
+from tofuse.engine.errors import InputError, on_command_line
 from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.parts import name_of
 
@@ -130,3 +133,28 @@ def test_memory_sizes_are_parsed(text: str, size: int) -> None:
 def test_invalid_memory_sizes_are_rejected(text: str) -> None:
     with pytest.raises(ArgumentTypeError, match="not an amount of memory"):
         _size(text)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("--mirrors",), "--mirrors: needs depth images"),
+        (("--unwrap",), "--unwrap: needs depth images"),
+        (("--object",), "--object: needs depth images.*--max-depth as well"),
+    ],
+)
+def test_options_for_images_are_refused_with_clouds(words: tuple[str, ...], says: str) -> None:
+    with on_command_line(), pytest.raises(InputError, match=says):
+        resolve(options_of(*words), "cloud")
+    resolve(options_of("--object", "--max-depth", "1"), "cloud")
+
+
+def test_another_method_is_refused_with_a_run_json(tmp_path: Path) -> None:
+    """Its options are all stated, so that the run would be of it, and be called by the other."""
+    path = tmp_path / "run.json"
+    config = from_method("default").to_dict()
+    path.write_text(json.dumps({"schema": 1, "version": __version__, "config": config}))
+    words = ("--config", str(path), "--method")
+    assert resolve(options_of(*words, "default")) == from_method("default")
+    with pytest.raises(InputError, match=r"is thesis, and .*run\.json states all options of def"):
+        resolve(options_of(*words, "thesis"))

@@ -324,6 +324,15 @@ def test_the_unit_of_a_file_is_recognised() -> None:
 
 
 @pytest.mark.nightly_part
+def test_lengths_of_any_size_are_compared() -> None:
+    """Their squares are no numbers."""
+    points = np.random.default_rng(0).uniform(0, [1, 1, 0], (2000, 3))
+    for tolerance_m, accuracy_m in ((1e-300, None), (1e300, 1e300)):
+        tofuse.compare(
+            points, points, tolerance_m=tolerance_m, accuracy_m=accuracy_m, guess=np.eye(4)
+        )
+
+
 def test_python_compares_meshes_and_clouds(part) -> None:
     surface = part.surface
     mesh = Mesh.of(GeometryRecord(surface.points, surface.faces))

@@ -152,6 +152,17 @@ def test_result_has_the_bound_of_its_run_unless_contradicted(recording, tmp_path
     assert edited.accuracy.position_m == pytest.approx(of_poses.accuracy.position_m, rel=0.01)
 
 
+def test_frames_without_a_given_pose_are_not_lost(recording, truth) -> None:
+    """The report of poses that are good said not to rely on them, as a half had none."""
+    some = truth.copy()
+    some[1::2] = some[2] = np.nan
+    found = tofuse.judge(recording, some)
+    assert found.started
+    assert found.refined.diagnostics.verdict == found.verdict == "good"
+    posed = np.flatnonzero(np.isfinite(some[:, 0, 0]))
+    assert [f.index for f in found.refined.diagnostics.frames] == posed.tolist()
+
+
 def test_jump_is_named_and_nothing_of_correct_poses(of_truth, of_bent) -> None:
     assert of_truth.cause is None
     assert of_truth.to_dict()["cause"] is None

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cli_calls import call
 from tofuse.apps.mirrors import find_mirrors, sentences
 from tofuse.apps.results import run_json
 from tofuse.engine.cameras import Pinhole
@@ -98,3 +99,9 @@ def test_run_json_without_mirrors_is_as_before(
     mirrored: tuple[Reconstruction, Reconstruction, Mirror, np.ndarray],
 ) -> None:
     assert "mirrors" not in run_json._content(mirrored[0])
+
+
+def test_run_says_that_there_is_none(room_recording, tmp_path, capfd) -> None:
+    words = ("--end", 3, "--out", tmp_path / "out", "--no-report", "--mirrors")
+    assert call("run", room_recording, *words) == 0
+    assert "no mirror was found" in "".join(capfd.readouterr())

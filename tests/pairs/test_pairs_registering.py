@@ -14,6 +14,7 @@ import tofuse
 from cli_calls import call
 from registration_scenes import error, stone, turn
 from tofuse.apps.pairs import pair_json, register_files
+from tofuse.apps.pairs.views import view_of
 from tofuse.engine.errors import InputError
 from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh
 from tofuse.engine.geometry import se3
@@ -55,6 +56,8 @@ def test_mesh_files_are_sampled_over_their_area(suffix, tmp_path) -> None:
     exchange.save(bench(), path, np.eye(3))
     near(tofuse.register(seen(bench()), path, guess=np.eye(4)))
     near(tofuse.register(seen(bench()), str(path), guess=np.eye(4)))
+    twice = view_of(path, "source", 2.0).points
+    np.testing.assert_allclose(twice, 2 * view_of(path, "source").points, rtol=1e-6)
 
 
 def test_meshes_clouds_and_frames_are_taken() -> None:

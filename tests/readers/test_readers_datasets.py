@@ -507,6 +507,20 @@ def test_head_of_xyz_is_skipped(tmp_path: Path, head: str) -> None:
     np.testing.assert_allclose(open_recording(tmp_path)[0].points, table[:, :3], rtol=1e-6)
 
 
+@pytest.mark.parametrize("head", ["Point,Northing,Easting,Height\n", "a;b;c;d\n"])
+def test_xyz_whose_names_leave_the_axes_open_is_refused(tmp_path: Path, head: str) -> None:
+    """An identifier in front was taken for x; northing before easting mirrors the cloud."""
+    (tmp_path / "a.xyz").write_text(head + "1,2,3,4\n")
+    with pytest.raises(InputError, match=r"a\.xyz: names its columns .*; call those of the coord"):
+        open_recording(tmp_path)[0]
+    for named in ("id,X_m,Y_m,Z_m\n", "id,x,y,z\n", "# of a scanner\n"):
+        (tmp_path / "a.xyz").write_text(named + "1,2,3,4\n")
+        first = 1 if "," in named else 0
+        assert open_recording(tmp_path)[0].points.tolist() == [[1.0, 2, 3, 4][first : first + 3]]
+    (tmp_path / "a.xyz").write_text("id x y z s s\n1 2 3 4 5 6\n")
+    assert open_recording(tmp_path)[0].points.tolist() == [[2, 3, 4]]
+
+
 @pytest.mark.parametrize(
     "head",
     ["# of a scanner\n//ID,X,Y,Z,Intensity,R,G,B\n20\n", "id;x[m];y[m];z[m];i;red;green;blue\n"],

@@ -180,6 +180,9 @@ def test_las_in_feet_is_refused(tmp_path: Path, kind: str) -> None:
                 tofuse.open(tmp_path / "a.las")
             frame = tofuse.open(tmp_path / "a.las", factor=0.3048006096)[0]
             np.testing.assert_allclose(frame.points, 0.3048006096 * POINTS, atol=0.01)
+            target = np.array([0.1, 0, 0]) + frame.points
+            found = tofuse.register(tmp_path / "a.las", target, scale=0.3048006096, guess=np.eye(4))
+            np.testing.assert_allclose(found.T_target_source[:3, 3], [0.1, 0, 0], atol=0.01)
 
 
 def test_las_with_excessive_point_count(tmp_path: Path) -> None:

@@ -204,6 +204,7 @@ DAMAGED: list[tuple[str, Change, str | tuple[int, ...], str]] = [
     ("ply", put("timestamps.txt", "0.5\n"), REFUSED, "timestamps.txt"),
     ("slam6d", put("scan000.pose", "1 2 3\n"), (), "scan000.pose"),
     ("ptx", put("b.ptx", "2\n3\n0 0 0\n"), REFUSED, "b.ptx: has no header of a PTX scan"),
+    ("ptx", put("b.ptx", "5\n-3\n" + "0\n" * 9), REFUSED, "b.ptx: has no header of a PTX scan"),
     ("ptx", put("b.ptx", ""), REFUSED, "b.ptx: has no header of a PTX scan"),
     ("ptx", put("b.ptx", b"\xff" * 99), REFUSED, "b.ptx: has no header of a PTX scan"),
     ("ptx", cut(20, "b.ptx"), (2,), "b.ptx: has 4 lines of 4 numbers, not 6 of 4 or 7"),

@@ -43,6 +43,15 @@ def test_far_sparse_points_do_not_decide_what_is_framed() -> None:
     assert np.ptp(scene.framed, axis=0)[0] < 0.2 * np.ptp(points[:, 0])
 
 
+def test_hidden_cameras_are_not_framed() -> None:
+    """The model filled the upper half of the picture, above cameras that are not shown."""
+    scene, _ = pair_scene(pair(sheet(1), sheet(2), np.eye(4)))
+    poses = se3.pose(np.eye(3), [0.5, 0.5, -0.5])[None]
+    shown = replace(scene, after=poses)
+    assert shown.box[0, 2] == -0.5
+    assert shown.framed[:, 2].min() > 0.9
+
+
 def test_distances_are_from_surfaces_not_points() -> None:
     ours, theirs = sheet(1, z=1.012), sheet(2)
     up = np.tile([0.0, 0, 1], (len(theirs), 1))

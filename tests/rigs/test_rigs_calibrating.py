@@ -186,6 +186,26 @@ def test_rig_is_not_taken_for_one_camera(tmp_path: Path, capsys) -> None:
         assert "is a rig of several cameras" in capsys.readouterr().err
 
 
+def test_options_reach_the_recordings_or_are_refused(tmp_path: Path, capsys) -> None:
+    """A factor had no effect."""
+    folder = written(tmp_path / "rig", 1)
+    cameras = [str(folder / f"cam{k}") for k in range(3)]
+    rows = [RigCamera(f"cam{k}", "", T, 1e-8 * np.eye(6)) for k, T in enumerate(relative(STANDS))]
+    rig = str(tmp_path / "rig.json")
+    write_rig(Path(rig), Rig(tuple(rows)))
+    run, out = ["run", "--rig", rig, *cameras], ["--out", str(tmp_path / "out")]
+    for words, says in (
+        ([*run, *out, "--factor", "2"], "--factor: can't be used with a rig"),
+        ([*run, *out, "--prior", "none"], "--prior: can't be used with a rig"),
+        ([*run, *out, "--topic", "/depth"], "--topic: does not apply to the format 'native'"),
+        (["rig", "calibrate", *cameras, *out, "--topic", "/depth"], "--topic: does not apply to"),
+        (["rig", "check", rig, *cameras, "--topic", "/depth"], "--topic: does not apply to"),
+    ):
+        assert main(words) == 2
+        assert says in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.nightly
 def test_rig_that_contradicts_images_is_reported(tmp_path: Path) -> None:
     folder = written(tmp_path / "rig", 1)

@@ -16,11 +16,13 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import math
 import numbers
 import pkgutil
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Literal, TypeVar
 
 from tofuse.engine import quantities
@@ -92,8 +94,8 @@ def name_of(obj: object) -> str:
     return str(type(obj).part_name)  # type: ignore[attr-defined]
 
 
-def check_number(value: Any, allowed: Bounds, name: str, *, whole: bool = False) -> None:
-    """Raise InputError for an argument that is no number, or outside the bounds.
+def check_number(value: Any, allowed: Bounds, name: str, *, whole: bool = False) -> Any:
+    """Return an argument as an int or a float, or raise InputError if it is none in the bounds.
 
     Parameters
     ----------
@@ -107,11 +109,16 @@ def check_number(value: Any, allowed: Bounds, name: str, *, whole: bool = False)
         Whether it has to be a whole number.
     """
     kind = numbers.Integral if whole else numbers.Real
-    fits = isinstance(value, kind) and not isinstance(value, bool)
-    if not fits or (int(value) if whole else float(value)) not in allowed:
+    number: float = math.nan
+    is_number = isinstance(value, kind) and not isinstance(value, bool)
+    if is_number:
+        with suppress(OverflowError):
+            number = int(value) if whole else float(value)
+    if number not in allowed:
         remedy = f"pass a {'whole' if whole else 'finite'} number"
         bounds = "" if allowed == Bounds() else f", {allowed}"
         raise InputError(f"is {value!r}", where=name, remedy=remedy + bounds)
+    return number
 
 
 def to_dict(obj: Any) -> Any:
@@ -247,6 +254,8 @@ def _inside(where: str, key: str) -> str:
 
 
 def _plain(hint: Any, data: Any, where: str) -> Any:
+    if isinstance(data, numbers.Real) and hasattr(data, "item"):  # one of NumPy's
+        data = data.item()
     if hint is Any:
         return data
     if hint is float and isinstance(data, int) and not isinstance(data, bool):

@@ -6,13 +6,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.bounds import Bounds
 from tofuse.engine.errors import InputError
+from tofuse.engine.parts import check_number
 
 MAX_GAP_S = 0.02  # between a frame and its pose
 # Longest median interval of frames, s; also for a camera that runs freely: most intervals, up to
 # these percentiles, differ by less than this factor. And units that are mistaken for seconds.
 _MAX_INTERVAL_S, _MAX_REGULAR_INTERVAL_S = 1000.0, 5.0
 _MOST, _REGULAR_RATIO, _MIN_INTERVALS = (12.5, 50.0, 87.5), 1.5, 4
+# Indices are stored as int64; intervals of longer times, of any unit, would overflow.
+_INDICES, _TIMES_S = Bounds(-(2**53), 2**53), Bounds(-1e20, 1e20)
 _UNITS = {"ms": 1e3, "us": 1e6, "ns": 1e9}
 
 
@@ -70,6 +74,15 @@ def associate(times_a: ArrayLike, times_b: ArrayLike, limit: float = MAX_GAP_S) 
         i, j = i[~mutual], np.delete(j, partner[mutual])
     pairs = np.concatenate(found)
     return pairs[np.lexsort((pairs[:, 0], a[pairs[:, 0]]))]
+
+
+def check_frame_time(index: int, timestamp: float) -> tuple[int, float]:
+    """Return the index and the time of a frame as int and float; InputError if no frame has them.
+
+    Differences of NumPy's numbers of few bits overflow.
+    """
+    number = check_number(index, _INDICES, "index of a frame", whole=True)
+    return number, check_number(timestamp, _TIMES_S, f"frame {index}: timestamp")
 
 
 def check_seconds(times: Float64) -> None:

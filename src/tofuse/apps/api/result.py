@@ -192,7 +192,9 @@ class Result(Reconstruction):
         if self.source is None or self.fitted is None:
             if self.folder is None:
                 raise InputError(
-                    "has no recording", where="the result", remedy="load it: tofuse.load(folder)"
+                    "has no recording",
+                    where="the result",
+                    remedy="use one of tofuse.reconstruct, or load the result of a recording",
                 )
             return locating.ResultMap.read(self.folder, None, Silent())
         return locating.ResultMap.of_result(self.source, self.fitted, self)

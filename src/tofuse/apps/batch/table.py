@@ -62,16 +62,16 @@ def _html(
     counts = Counter(row["tone"] for row in rows)
     failed = sum(record.state == "failed" for _, record in ended)
     facts = [
-        ("recordings", f"{total}"),
-        ("good", f"{counts['good']}"),
-        ("degraded", f"{counts['degraded']}"),
-        ("failed", f"{counts['failed'] - failed}"),
-        ("no result", f"{failed}"),
+        ("Recordings", f"{total}"),
+        ("Good", f"{counts['good']}"),
+        ("Degraded", f"{counts['degraded']}"),
+        ("Failed", f"{counts['failed'] - failed}"),
+        ("No result", f"{failed}"),
     ]
     if len(ended) < total:
-        facts.append(("pending", f"{total - len(ended)}"))
+        facts.append(("Pending", f"{total - len(ended)}"))
     seconds = sum(record.seconds or 0 for _, record in ended)
-    facts.append(("total time", duration(seconds)))
+    facts.append(("Total time", duration(seconds)))
     return html.page(
         "batch.html.j2",
         title=folder.path.name,

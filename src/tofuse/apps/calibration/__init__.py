@@ -10,7 +10,12 @@ from tofuse._faces import face
 
 if TYPE_CHECKING:
     from tofuse.apps.calibration.board import Board
-    from tofuse.apps.calibration.camera_json import check_new, recording_fields, write_camera_json
+    from tofuse.apps.calibration.camera_json import (
+        check_new,
+        fields_without_lens,
+        recording_fields,
+        write_camera_json,
+    )
     from tofuse.apps.calibration.depth import calibrate_depth, compose
     from tofuse.apps.calibration.lens import calibrate_lens
     from tofuse.apps.calibration.noise_estimation import estimate_noise

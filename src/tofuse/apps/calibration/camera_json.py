@@ -27,13 +27,18 @@ def recording_fields(recording: Recording) -> dict[str, Any]:
     """Return the fields of camera.json that describe a recording's images, without the lens."""
     path = Path(recording.path) / "camera.json"
     if reading.is_folder(Path(recording.path)) and reading.is_file(path):
-        return {key: value for key, value in reading.read_json(path).items() if key not in _LENS}
+        return fields_without_lens(path)
     metadata = {key: recording.metadata.get(key) for key in _METADATA}
     present = {key: value for key, value in metadata.items() if value is not None}
     frame = next((f for f in recording.sample(3) if isinstance(f, RangeFrame)), None)
     if frame is not None:
         present.setdefault("depth_kind", frame.depth_kind)
     return present
+
+
+def fields_without_lens(path: Path) -> dict[str, Any]:
+    """Return the fields of a camera.json that are not of the lens."""
+    return {key: value for key, value in reading.read_json(path).items() if key not in _LENS}
 
 
 def write_camera_json(path: Path, camera: Pinhole, about: dict[str, Any]) -> None:

@@ -15,6 +15,7 @@ from tofuse.apps.calibration import (
     check_new,
     compose,
     estimate_noise,
+    fields_without_lens,
     recording_fields,
     scene_planes,
     write_camera_json,
@@ -169,6 +170,8 @@ def _import_lens(arguments: Calibrate) -> Summary:
         )
     if recording is not None:
         metadata = recording_fields(recording)
+    elif arguments.out is not None and arguments.out.is_file():
+        metadata = fields_without_lens(arguments.out)  # the unit of its recording's images
     else:
         metadata = {"depth_unit_m": lens_file.depth_unit_m, "depth_kind": lens_file.depth_kind}
         if assumption := camera_file.assumption(arguments.inputs[0]):

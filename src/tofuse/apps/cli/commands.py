@@ -38,7 +38,7 @@ _NAME_WIDTH = 14  # width of the column of names
 _STATUS_COLORS = {True: "green", False: "red", None: "yellow"}
 _NOT_WITH_RIG = (
     *("view", "loops", "guess", "moving", "object"),
-    *("average_still", "camera", "topic", "no_report", "profile", "mirrors"),
+    *("average_still", "camera", "no_report", "profile", "mirrors", "factor", "prior"),
 )
 VERDICT_COLORS = {"good": "green", "degraded": "yellow", "failed": "red", "note": "cyan"}
 
@@ -143,7 +143,7 @@ def _run_rig(arguments: cli.Run) -> int:
 
     options = run_options(arguments)
     for name in _NOT_WITH_RIG:
-        if getattr(arguments, name):
+        if getattr(arguments, name) != getattr(type(arguments), name):
             option = f"--{name.replace('_', '-')}"
             raise InputError("can't be used with a rig", where=option, remedy="leave it out")
     with progress_for(as_json=arguments.json) as progress:
@@ -159,8 +159,10 @@ def _run_live(arguments: cli.Run) -> int:
     from tofuse.apps.viewer import LiveView, address, serve, stop
     from tofuse.engine.progress import CombinedProgress
 
-    if arguments.profile:
-        raise InputError("can't be used with --view", where="--profile", remedy="leave one out")
+    for name in ("profile", "no_report"):
+        if getattr(arguments, name):
+            option = f"--{name.replace('_', '-')}"
+            raise InputError("can't be used with --view", where=option, remedy="leave one out")
     options = run_options(arguments)
     folders.check_output(arguments.out, overwrite=arguments.overwrite)  # before a browser opens
     server = serve(arguments.port)

@@ -571,12 +571,15 @@ class RigOptions(Json, Threads):
         whether the cameras are static (default: detected from the images)
     format : F
         input format, if not recognised
+    topic : T
+        of bags: the topic of the depth images, if not recognised
     """
 
     home = "tofuse.apps.cli.rigging"
 
     motion: Literal["auto", "still", "moving"] = "auto"
     format: str | None = None
+    topic: str | None = None
 
 
 class RigCalibrate(RigOptions):

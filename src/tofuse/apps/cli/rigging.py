@@ -32,6 +32,7 @@ def _calibrated(
             names=names,
             motion=arguments.motion,
             format=arguments.format,
+            topic=arguments.topic,
             threads=arguments.threads,
             progress=progress,
         )

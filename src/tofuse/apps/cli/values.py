@@ -43,13 +43,11 @@ def path(text: str) -> Path:
 
 
 def _number(text: str, kind: type) -> Any:
-    """Read a number; NaN if the text is none, an error if it should be whole."""
     try:
         return kind(text)
     except ValueError as error:
-        if kind is float:
-            return math.nan
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from error
+        what = "a whole number" if kind is int else "a number"
+        raise argparse.ArgumentTypeError(f"{text!r} is not {what}") from error
 
 
 def _within(bounds: Bounds, value: Any, text: str) -> Any:

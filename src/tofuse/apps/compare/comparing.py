@@ -13,7 +13,14 @@ from numpy.typing import ArrayLike
 from tofuse._version import __version__
 from tofuse.apps.compare.deviations import COVERAGE, DeviationMap, Places, fitted, mapped
 from tofuse.apps.compare.nearest import Reach, Reference, measured_points
-from tofuse.apps.compare.surface import Comparable, Surface, in_metres, spacing_of, surface_of
+from tofuse.apps.compare.surface import (
+    UNITS_M,
+    Comparable,
+    Surface,
+    in_metres,
+    spacing_of,
+    surface_of,
+)
 from tofuse.apps.pairs import PairResult, pair_words, register
 from tofuse.apps.report import scene
 from tofuse.apps.results import run_json
@@ -310,6 +317,8 @@ def compare(
     for value, where in ((tolerance_m, "tolerance_m"), (accuracy_m, "accuracy_m")):
         if value is not None:
             check_number(value, Bounds(0, exclusive=True), where)
+    if unit is not None and (not isinstance(unit, str) or unit not in UNITS_M):
+        raise InputError(f"is {unit!r}", where="unit", remedy=f"use one of {', '.join(UNITS_M)}")
     measured, nominal, said = in_metres(surface_of(result), surface_of(reference), unit)
     if accuracy_m is not None:
         measured = replace(measured, shared_m=accuracy_m / OF_95_PERCENT)
@@ -334,8 +343,7 @@ def compared(
         T = registration.T_target_source
     reference = _facing_alike(measured, reference, T)
     T, free = fitted(measured, reference, T, reach, tolerance_m)
-    shared = [measured.shared_m, reference.surface.shared_m]
-    shared_m = float(np.sqrt(sum((s or 0.0) ** 2 for s in shared)))
+    shared_m = float(np.hypot(measured.shared_m or 0.0, reference.surface.shared_m or 0.0))
     deviations = mapped(measured, reference, T, reach, tolerance_m, shared_m, free)
     if not len(deviations.places.deviation):
         why = "; ".join(filter(None, (said, reason)))

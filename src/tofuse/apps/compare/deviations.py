@@ -419,8 +419,8 @@ def _place_size(
     if tolerance_m is None:
         size = _PLACE_FRACTION * reference.diagonal
     else:
-        needed = (COVERAGE * noise / (_MEAN_NOISE * tolerance_m)) ** 2
-        size = spacing * float(np.sqrt(np.clip(needed, FEWEST, _MOST)))
+        needed = COVERAGE * noise / (_MEAN_NOISE * tolerance_m)
+        size = spacing * float(np.clip(needed, FEWEST**0.5, _MOST**0.5))
     size = min(size, _MAX_PLACE_FRACTION * reference.diagonal)
     fewest = float(np.sqrt(reference.area.sum() / _MAX_PLACES))
     return max(size, spacing * FEWEST**0.5, fewest)

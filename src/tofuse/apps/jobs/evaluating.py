@@ -104,7 +104,7 @@ def evaluate(
     """
     if reference_error_m is not None:
         check_number(reference_error_m, Bounds(0), "reference_error_m")
-    if isinstance(recording, str | Path):
+    if recording is not None and not isinstance(recording, Recording):
         recording = open_recording(recording)
     names = [
         str(source) if isinstance(source, str | Path) else name
@@ -245,5 +245,6 @@ def _timed(
             f"holds {quantities.count(len(timed.poses), 'pose')}, and the recording "
             f"{quantities.count(len(clock[0]), 'frame')}",
             where=name,
+            remedy="pass one for each frame, NaN where there is none",
         )
     return clock[0], timed.poses

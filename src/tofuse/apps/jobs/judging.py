@@ -33,7 +33,7 @@ from tofuse.engine.frames import Frame, Recording, Source, evenly_spaced, frame_
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import Config, adaptation, clips, from_method, reconstructing
 from tofuse.engine.parts import check_number
-from tofuse.engine.progress import Progress, Silent
+from tofuse.engine.progress import Progress, receiver
 from tofuse.engine.quality import (
     cross_view_agreement,
     map_agreement,
@@ -124,7 +124,10 @@ class Judgement:
 
     @cached_property
     def refined(self) -> Reconstruction:
-        """The result of all frames, as a run makes it; computed when it is first used."""
+        """The result of all frames, as a run makes it; computed when it is first used.
+
+        Where it began with the poses, it is of the frames that have one.
+        """
         return self._reconstruct()
 
     def __repr__(self) -> str:
@@ -193,9 +196,9 @@ def judge(
         If fewer than two frames have a pose, or the recording contains clouds; if the scale is
         unknown and can't be estimated.
     """
-    progress = progress or Silent()
+    progress = receiver(progress)
     if tolerance_m is not None:
-        check_number(tolerance_m, Bounds(0, exclusive=True), "tolerance_m")
+        tolerance_m = check_number(tolerance_m, Bounds(0, exclusive=True), "tolerance_m")
     if not isinstance(recording, Recording):
         recording = open_recording(recording)
     check_one_camera(recording)
@@ -257,9 +260,12 @@ def judge(
     )
 
     def reconstruct() -> Reconstruction:
-        started = refined.started
-        source = adaptation.with_odometry(recording, poses) if started else recording
-        config_used = replace(given_config, refinement=config.refinement) if started else config
+        source, config_used = recording, config
+        if refined.started:
+            # Frames to which no pose was given are not lost.
+            posed = recording.indices[np.isfinite(poses).all((1, 2))]
+            source = replace(adaptation.with_odometry(recording, poses), indices=posed)
+            config_used = replace(given_config, refinement=config.refinement)
         return reconstructing.reconstruct(source, config_used, threads=threads, progress=progress)
 
     return Judgement(

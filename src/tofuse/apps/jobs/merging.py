@@ -89,7 +89,7 @@ def merge(
     """
     progress = progress or Silent()
     if tolerance_m is not None:
-        check_number(tolerance_m, Bounds(0, exclusive=True), "tolerance_m")
+        tolerance_m = check_number(tolerance_m, Bounds(0, exclusive=True), "tolerance_m")
     sessions = read_sessions(results, threads, progress)
     config = merged_config(sessions)
     if tolerance_m is not None:

@@ -28,6 +28,7 @@ from tofuse.formats.files import reading
 from tofuse.formats.recordings import OpeningOptions
 
 _SAMPLED = 8  # frames that are checked for the input of --unwrap
+_NO_IMAGES = "needs depth images, and these are clouds"
 _BACKGROUND_FILTERS = {"background", "foreground", "mask", "box"}
 
 
@@ -116,9 +117,19 @@ class Options(OpeningOptions, ModelOptions):
 def resolve(options: Options, kind: ViewKind = "range") -> Config:
     """Return the configuration that the options specify, for a kind of view."""
     changes: dict[str, Any] = read_changes(options.config) if options.config else {}
+    for name in ("mirrors", "unwrap"):
+        if kind == "cloud" and getattr(options, name):
+            raise InputError(_NO_IMAGES, where=f"--{name}", remedy="leave it out")
     method = options.method or changes.get("method") or "default"
     if not isinstance(method, str):
         raise InputError(f"is {method!r}", where=f"{options.config}: method")
+    # A run.json states every option, so that nothing of another method would be left.
+    if options.config and options.config.suffix == ".json" and method != changes.get("method"):
+        raise InputError(
+            f"is {method}, and {options.config} states all options of {changes.get('method')}",
+            where="--method",
+            remedy="leave one out, or write the options that differ to a .toml",
+        )
     config = from_method(
         method, kind, where="--method" if options.method else f"{options.config}: method"
     )
@@ -149,13 +160,16 @@ def resolve(options: Options, kind: ViewKind = "range") -> Config:
     if options.object:
         cuts = {item["part"] for item in current["filters"]} & _BACKGROUND_FILTERS
         if options.max_depth is None and not cuts:
+            if kind == "cloud":
+                remedy = "cut the background off with --max-depth as well"
+                raise InputError(_NO_IMAGES, where="--object", remedy=remedy)
             filters.append({"part": "background"})
         # Scattered light of the background is fixed to the image, and drags the object along.
         if "multipath" in names and "scattering" not in names:
             corrections.insert(names.index("multipath"), {"part": "scattering"})
         # Neither gravity nor the camera's odometry applies to the coordinate frame of the object.
         config = changed(config, {"priors": []}, where="--object")
-    if options.unwrap and kind == "range" and "unwrap" not in names:
+    if options.unwrap and "unwrap" not in names:
         corrections.insert(0, {"part": "unwrap"})
     if filters or corrections != current["corrections"]:
         lists = {"filters": [*filters, *current["filters"]], "corrections": corrections}

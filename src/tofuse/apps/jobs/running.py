@@ -155,13 +155,13 @@ def _open(inputs: Sequence[str | Path], options: Options, progress: Progress) ->
 def _without_mirrors(
     job: _Job, result: Reconstruction, options: Options, progress: Progress
 ) -> Reconstruction:
-    """Find the mirrors of the main model; with a note on each."""
+    """Find the mirrors of the main model; with a note on each, or that there is none."""
     from tofuse.apps.mirrors import find_mirrors, sentences
 
     progress.stage("looking for mirrors")
     with threads(options.threads), threadpool_limits(1):
         result = find_mirrors(job.recording, result, job.seed)
-    for sentence in sentences(result):
+    for sentence in sentences(result) or ["no mirror was found"]:
         progress.note(sentence)
     return result
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -11,7 +12,6 @@ from threadpoolctl import threadpool_limits
 from tofuse.apps.pairs.registering import (
     MAX_RISK,
     RISKS,
-    at_factor,
     at_risk,
     registered_near,
     registered_scaled,
@@ -103,7 +103,7 @@ def _registered(
     if options.scale and options.factor is not None:
         raise InputError("are exclusive", where="--scale, --factor", remedy="leave one out")
     views = _open_both(source, target, options)
-    near = NearOrigin.of(at_factor(views[0].frame, options.factor), views[1].frame, guess)
+    near = NearOrigin.of(views[0].frame, views[1].frame, guess)
     progress.stage("registering")
     start_s = perf_counter()
     if options.scale:
@@ -123,18 +123,18 @@ def _open_both(source: str, target: str, options: PairOptions) -> tuple[SingleVi
     """Open both views; one of them may be a cloud, which needs no camera."""
     views: list[SingleView] = []
     refusals: list[InputError] = []
-    for name in (source, target):
-
-        def open_with(camera: Path | None, name: str = name) -> SingleView:
-            return named_view(name, format=options.format, camera=camera, topic=options.topic)
+    for name, factor in ((source, options.factor), (target, None)):
+        open_with = partial(
+            named_view, name, format=options.format, topic=options.topic, factor=factor
+        )
 
         try:
-            views.append(open_with(options.camera))
+            views.append(open_with(camera=options.camera))
         except InputError as error:
             if error.where != "--camera":
                 raise
             refusals.append(error)
-            views.append(open_with(None))
+            views.append(open_with())
     if len(refusals) == 2:
         raise refusals[0]
     return views[0], views[1]

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 from tofuse.apps.pairs.views import View, view_of
 from tofuse.engine.alignment import Registrar, Registration
 from tofuse.engine.bounds import Bounds
-from tofuse.engine.clouds import AnyPair, NearOrigin, register_similar, scaled
+from tofuse.engine.clouds import AnyPair, NearOrigin, register_similar
 from tofuse.engine.compute import one_blas_thread
 from tofuse.engine.errors import InputError, signals_as_themselves
-from tofuse.engine.frames import Frame, RangeFrame
+from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number, discover, name_of, registered
 from tofuse.engine.quantities import percent
@@ -97,9 +97,10 @@ def register(
     check_number(seed, Bounds(0), "seed", whole=True)
     check_number(risk, RISKS, "risk")
     start = None if guess is None else se3.check_pose(guess, where="guess")
-    factor = None if isinstance(scale, bool | np.bool_) else scale
-    moving = at_factor(view_of(source, "source"), factor, "scale")
-    near = NearOrigin.of(moving, view_of(target, "target"), start)
+    factor = None
+    if not isinstance(scale, bool | np.bool_):
+        factor = check_number(scale, FACTORS, "scale")
+    near = NearOrigin.of(view_of(source, "source", factor), view_of(target, "target"), start)
     if scale and factor is None:
         near, registration = registered_scaled(near, method, seed)
     else:
@@ -107,16 +108,8 @@ def register(
     return near.in_files(at_risk(with_factor(registration, factor), risk))
 
 
-def at_factor(view: Frame, factor: float | None, where: str = "--factor") -> Frame:
-    """Return a view in the unit of the other one: its points times a factor; itself for None."""
-    if factor is None:
-        return view
-    check_number(factor, FACTORS, where)
-    return scaled(view, factor)
-
-
 def with_factor(registration: Registration, factor: float | None) -> Registration:
-    """Return the registration of a view `at_factor`, with that as its exact scale."""
+    """Return the registration of a source in another unit, with its factor as the exact scale."""
     return registration if factor is None else replace(registration, scale=factor, scale_sigma=0.0)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from tofuse.apps.results import folders, read_cloud
 from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds import MIN_POINTS
+from tofuse.engine.clouds import MIN_POINTS, scaled
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
 from tofuse.engine.fusion import Mesh
@@ -34,7 +34,7 @@ class HasPoints(Protocol):
 View: TypeAlias = Frame | Reconstruction | Mesh | HasPoints | ArrayLike | str | os.PathLike[str]
 
 
-def view_of(view: View, name: str) -> Frame:
+def view_of(view: View, name: str, factor: float | None = None) -> Frame:
     """Return what has points as a view.
 
     Parameters
@@ -43,21 +43,31 @@ def view_of(view: View, name: str) -> Frame:
         See `register`.
     name
         Of the argument, for errors.
+    factor
+        Of its unit in that of the result.
 
     Raises
     ------
     InputError
         If it has fewer than ten finite points, or is nothing of that kind.
     """
-    if isinstance(view, RangeFrame | CloudFrame):
-        return view
     if isinstance(view, str | os.PathLike):
-        return named_view(os.fspath(view)).frame
+        return named_view(os.fspath(view), factor=factor).frame
+    if isinstance(view, RangeFrame | CloudFrame):
+        return at_factor(view, factor)
+    points: ArrayLike
     if isinstance(view, Reconstruction):
-        return CloudFrame.of(_checked(view.cloud.points + view.shift, name))
-    if isinstance(view, Mesh):
-        return CloudFrame.of(_checked(surface_points(view.record(), name), name))
-    return CloudFrame.of(_checked(view.points if isinstance(view, HasPoints) else view, name))
+        points = view.cloud.points + view.shift
+    elif isinstance(view, Mesh):
+        points = surface_points(view.record(), name)
+    else:
+        points = view.points if isinstance(view, HasPoints) else view
+    return at_factor(CloudFrame.of(_checked(points, name)), factor)
+
+
+def at_factor(view: Frame, factor: float | None) -> Frame:
+    """Return a view in another unit: its points times a factor; itself for None."""
+    return view if factor is None else scaled(view, factor)
 
 
 def named_view(
@@ -66,18 +76,21 @@ def named_view(
     format: str | None = None,  # noqa: A002
     camera: Path | None = None,
     topic: str | None = None,
+    factor: float | None = None,
 ) -> SingleView:
     """Read the view called `name`: the cloud of a result, or see `open_view`."""
     folder = Path(name)
     if format is None and folders.named_result(folder):
         frame = CloudFrame.of(_checked(read_cloud(folder).points, name))
-        return SingleView(name, name, "result", 0, frame)
-    return open_view(name, format=format, camera=camera, topic=topic, file_axes=True)
+        return SingleView(name, name, "result", 0, at_factor(frame, factor))
+    return open_view(name, format=format, camera=camera, topic=topic, factor=factor, file_axes=True)
 
 
 def _checked(points: ArrayLike, name: str) -> Float64:
     """Return the finite points of an array (n, 3)."""
     try:
+        if isinstance(points, np.ma.MaskedArray) and points.ndim == 2:
+            points = points.data[~np.ma.getmaskarray(points).any(1)]
         array = np.asarray(points)
     except ValueError as error:
         raise InputError("is not an array", where=name, remedy="pass (N, 3) numbers") from error

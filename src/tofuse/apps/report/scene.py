@@ -104,16 +104,8 @@ class Scene:
 
     @property
     def framed(self) -> Float64:
-        """(K, 3) extreme points of the content of the box, which must be in view."""
-        low, high = self.box
-        cameras = self.after[:, :3, 3]
-        cameras_in_box = cameras[((cameras >= low) & (cameras <= high)).all(1)]
-        extremes = [
-            extreme_points(part, outer)
-            for part, outer in ((self.points, self.outer), (cameras_in_box, 0.0))
-            if len(part)
-        ]
-        return np.concatenate(extremes) if extremes else np.stack([low, high])
+        """(K, 3) extreme points of the model, to be in view; cameras are hidden at first."""
+        return extreme_points(self.points, self.outer) if len(self.points) else self.box
 
     @property
     def center(self) -> Float64:

@@ -25,6 +25,7 @@ def calibrate(
     names: Sequence[str] | None = None,
     motion: Motion = "auto",
     format: str | None = None,  # noqa: A002
+    topic: str | None = None,
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
@@ -40,6 +41,8 @@ def calibrate(
         Whether the rig moves; "auto" detects it.
     format
         Format of the recordings; detected by default.
+    topic
+        Topic of the depth images in all bags; detected by default.
     threads
         Number of threads; None: all cores.
     progress
@@ -51,7 +54,7 @@ def calibrate(
         If a recording can't be used, or no camera can be placed relative to the first one.
     """
     with using_threads(threads), threadpool_limits(1):
-        return calibrate_cameras(open_cameras(recordings, format, names), motion, progress)
+        return calibrate_cameras(open_cameras(recordings, format, names, topic), motion, progress)
 
 
 def calibrate_cameras(

@@ -83,6 +83,7 @@ def open_cameras(
     paths: Sequence[str | Path],
     format: str | None = None,  # noqa: A002
     names: Sequence[str] | None = None,
+    topic: str | None = None,
 ) -> list[Camera]:
     """Open the recordings of a rig's cameras, by default named after their files or folders.
 
@@ -115,7 +116,7 @@ def open_cameras(
                 remedy=f"pass the recordings in the order {', '.join(names or ())}, or rename it",
             )
     return [
-        Camera(name, open_recording(path, format=format))
+        Camera(name, open_recording(path, format=format, topic=topic))
         for name, path in zip(names or own_names, paths, strict=True)
     ]
 

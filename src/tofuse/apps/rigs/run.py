@@ -80,7 +80,9 @@ def run_rig(
     OutputError
         If the result can't be written.
     """
-    opening = Opening(tuple(map(Path, inputs)), rig_file, format=options.format)
+    opening = Opening(
+        tuple(map(Path, inputs)), rig_file, format=options.format, topic=options.topic
+    )
     if rig_file is None:
         rig_file = unzipped(inputs[0]) / FILE_NAME
         inputs = list(recordings_of(rig_file).values())
@@ -88,7 +90,8 @@ def run_rig(
         progress.stage("opening")
         rig = read_rig(rig_file)
         rig.check_count(len(inputs), rig_file)
-        cameras = open_cameras(inputs, options.format, [camera.name for camera in rig.cameras])
+        names = [camera.name for camera in rig.cameras]
+        cameras = open_cameras(inputs, options.format, names, options.topic)
         source = RigSource(rig, [camera.recording for camera in cameras])
         full_recording = Recording.of(source, " ".join(map(str, opening.paths)), "rig")
         recording = _selected(full_recording, source, options)

@@ -18,7 +18,9 @@ from http.cookies import SimpleCookie
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
+from tofuse.engine.bounds import Bounds
 from tofuse.engine.errors import InputError
+from tofuse.engine.parts import check_number
 from tofuse.formats.files import reading
 
 if TYPE_CHECKING:
@@ -160,8 +162,10 @@ def choose_port(port: int | None) -> int:
     InputError
         If it is in use.
     """
+    if port is not None:
+        port = check_number(port, Bounds(1, 65535), "--port", whole=True)
     for candidate in range(PORT, PORT + _MAX_PORTS) if port is None else (port,):
-        with socket.socket() as probe, suppress(OSError, OverflowError):
+        with socket.socket() as probe, suppress(OSError):
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((HOST, candidate))
             return candidate

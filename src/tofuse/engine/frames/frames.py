@@ -21,6 +21,7 @@ from tofuse.engine.cameras import Camera, depth_conversion, unknown_rays
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.parts import check_number
+from tofuse.engine.times import check_frame_time
 
 DepthKind = Literal["z", "range"]
 AmplitudeKind = Literal["raw", "range_compensated", "ir"]
@@ -42,6 +43,9 @@ IMAGES = (
     "shared_sigma_image",
     "normal_image",
 )
+
+
+_METRES = ("depth", "sigma_image", "shared_sigma_image")
 
 
 # Names of the columns (N, ...) of a `CloudFrame`.
@@ -118,9 +122,12 @@ class RangeFrame:
             )
         for kind, known in (("depth_kind", DepthKind), ("amplitude_kind", AmplitudeKind)):
             value, choices = getattr(self, kind), get_args(known)
-            if value not in choices:
+            if not isinstance(value, str) or value not in choices:
                 remedy = f"use one of {', '.join(choices)}"
                 raise InputError(f"is {value!r}", where=f"{where}: {kind}", remedy=remedy)
+        if self.ambiguity_m is not None:
+            positive = Bounds(0, exclusive=True)
+            check_number(self.ambiguity_m, positive, f"{where}: ambiguity_m")
         shape = (self.camera.height, self.camera.width)
         for name in IMAGES:
             image = getattr(self, name)
@@ -134,14 +141,14 @@ class RangeFrame:
             if not is_array or image.ndim != 2 + len(last) or image.shape[2:] != last:
                 given = f"an array of shape {image.shape}" if is_array else type(image).__name__
                 raise InputError(
-                    f"is {given}, not numbers of shape (H, W{', 3' if last else ''})",
+                    f"is {given}",
                     where=f"{where}: {name}",
-                    remedy="pass a NumPy array",
+                    remedy=f"pass a NumPy array of numbers (H, W{', 3' if last else ''})",
                 )
             # Integers are in another unit than metres, and floats of colour may end at 1.
-            if name == "depth" and image.dtype.kind != "f":
+            if name in _METRES and image.dtype.kind != "f":
                 remedy = "use floats in metres: divide integers in millimetres by 1000"
-                raise InputError(f"is {image.dtype}", where=f"{where}: depth", remedy=remedy)
+                raise InputError(f"is {image.dtype}", where=f"{where}: {name}", remedy=remedy)
             if name in ("color_image", "confidence_image") and image.dtype != np.uint8:
                 remedy = "use uint8, from 0 to 255"
                 raise InputError(f"is {image.dtype}", where=f"{where}: {name}", remedy=remedy)
@@ -251,7 +258,7 @@ class CloudFrame:
     index, timestamp
         Frame index in the recording, and s.
     points
-        (N, 3) m, finite, in the sensor frame.
+        (N, 3) m, in the sensor frame; those that are NaN, or masked, are dropped.
     normals
         (N, 3) unit normals; None where not known.
     sigma
@@ -282,21 +289,26 @@ class CloudFrame:
 
     def __post_init__(self) -> None:
         _check_frame(self)
-        is_array = isinstance(self.points, np.ndarray)
+        is_array = isinstance(self.points, np.ndarray) and self.points.dtype.kind in "fiu"
         if not is_array or self.points.ndim != 2 or self.points.shape[1] != 3:
             given = (
                 f"shape {self.points.shape}" if is_array else f"type {type(self.points).__name__}"
             )
             raise InputError(
-                f"points have {given}", where=f"frame {self.index}", remedy="pass an (N, 3) array"
+                f"points have {given}",
+                where=f"frame {self.index}",
+                remedy="pass an (N, 3) array of numbers",
             )
-        largest = np.abs(self.points).max(initial=0)
+        points = _filled(self.points)
+        valid = ~np.isnan(points).any(1)
+        largest = np.abs(points[valid]).max(initial=0)
         if largest > se3.MAX_COORDINATE_M:
             raise InputError(
                 f"points have coordinates up to {largest:.0e} m",
                 where=f"frame {self.index}",
                 remedy="use metres, and leave out invalid points",
             )
+        object.__setattr__(self, "points", np.asarray(points, np.float32))
         for name in ("origin", "shift"):
             place = getattr(self, name)
             if np.shape(place) != (3,) or not np.isfinite(place).all():
@@ -310,6 +322,9 @@ class CloudFrame:
             )
         columns = {name: getattr(self, name) for name in COLUMNS}
         _check_columns(self.index, len(self.points), columns)
+        for name, column in columns.items():
+            if column is not None and not valid.all():
+                object.__setattr__(self, name, np.asarray(column)[valid])
 
     @classmethod
     def of(
@@ -337,7 +352,7 @@ class CloudFrame:
         columns
             `normals`, `amplitude` and `color` of all points.
         """
-        array = np.asarray(points)
+        array = _filled(points)
         if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
             raise InputError(
                 f"is an array of shape {array.shape} and type {array.dtype}",
@@ -351,7 +366,7 @@ class CloudFrame:
             # False for NaN; the squares of the remaining coordinates fit into float32.
             valid = (np.abs(array) < se3.MAX_COORDINATE_M).all(1)
         if shift.any():
-            _check_rounding(np.asarray(points).dtype, array[valid], shift)
+            _check_rounding(_filled(points).dtype, array[valid], shift)
         if not valid.all():
             array = array[valid]
             columns = {name: v if v is None else v[valid] for name, v in columns.items()}
@@ -476,6 +491,14 @@ def _check_rounding(dtype: np.dtype[Any], points: Float64, shift: Float64) -> No
         )
 
 
+def _filled(points: ArrayLike) -> NDArray[Any]:
+    """The array of points, NaN where it is masked."""
+    if not isinstance(points, np.ma.MaskedArray):
+        return np.asarray(points)
+    floats = np.asarray(points.data, np.result_type(points.data, np.float32))
+    return np.where(np.ma.getmaskarray(points), np.float32(np.nan), floats)
+
+
 def _check_columns(index: int, count: int, columns: Mapping[str, ArrayLike | None]) -> None:
     """Raise InputError if a column of a cloud has no value for each point."""
     for name, column in columns.items():
@@ -488,12 +511,8 @@ def _check_columns(index: int, count: int, columns: Mapping[str, ArrayLike | Non
             )
 
 
-# Indices are stored as int64; intervals of longer times, of any unit, would overflow.
-_MAX_INDEX, _MAX_TIME_S = 2**53, 1e20
-
-
 def _check_frame(frame: Frame) -> None:
-    """Raise InputError for an index or a timestamp that no frame can have."""
-    indices, times = Bounds(-_MAX_INDEX, _MAX_INDEX), Bounds(-_MAX_TIME_S, _MAX_TIME_S)
-    check_number(frame.index, indices, "index of a frame", whole=True)
-    check_number(frame.timestamp, times, f"frame {frame.index}: timestamp")
+    """Make index and timestamp plain numbers: differences of NumPy's of few bits overflow."""
+    index, timestamp = check_frame_time(frame.index, frame.timestamp)
+    object.__setattr__(frame, "index", index)
+    object.__setattr__(frame, "timestamp", timestamp)

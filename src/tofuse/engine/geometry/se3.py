@@ -15,6 +15,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 
 MAX_COORDINATE_M = 1e9  # larger coordinates are considered damaged
+_MATRIX = "use a rigid motion (4, 4): a rotation, a translation in m, and a last row of 0 0 0 1"
 _SMALL = 1e-4  # rad; below it the series are exact to float64
 
 
@@ -229,13 +230,15 @@ def check_pose(T: ArrayLike, *, where: str = "pose") -> Float64:
     try:
         T = np.asarray(T, float)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError("is not a matrix of numbers", where=where) from error
+        raise InputError("is not a matrix of numbers", where=where, remedy=_MATRIX) from error
     if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise InputError("is not a finite 4x4 matrix", where=where)
+        shape = "" if T.shape == (4, 4) else f", but has shape {T.shape}"
+        raise InputError(f"is not a finite 4x4 matrix{shape}", where=where, remedy=_MATRIX)
     R = T[:3, :3]
     # The first condition excludes overflow in the others.
     if np.abs(R).max() > 2 or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-        raise InputError("has no rotation in its upper left 3x3 block", where=where)
+        problem = "has no rotation in its upper left 3x3 block"
+        raise InputError(problem, where=where, remedy=_MATRIX)
     if np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
         # Of a transposed pose the last column is 0 0 0 1.
         remedy = None if T[:3, 3].any() else "transpose it: it seems to be stored by columns"

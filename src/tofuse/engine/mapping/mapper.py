@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import wraps
 from threading import RLock
@@ -34,6 +35,7 @@ from tofuse.engine.progress import OnlineMap, Progress, receiver
 from tofuse.engine.results import FrameRecord, Reconstruction
 from tofuse.engine.stopwatch import current, timing
 from tofuse.engine.stored_views import PosedView
+from tofuse.engine.times import check_frame_time
 from tofuse.engine.tracking import FrameTime, Step, Tracker
 from tofuse.engine.views import PreparedView
 
@@ -249,11 +251,17 @@ class Mapper:
         Parameters
         ----------
         index, timestamp
-            Frame index, larger than those before (else InputError), and s.
+            Frame index, larger than those before, and s.
         reason
             Why it could not be read.
+
+        Raises
+        ------
+        InputError
+            If no frame can have that index or timestamp.
         """
         self._check_open()
+        index, timestamp = check_frame_time(index, timestamp)
         self._sequence.check_order(index)
         self._sequence.accept(index)
         self._log.add(FrameRecord(index, timestamp, "skipped", reason), None)
@@ -406,9 +414,10 @@ def _odometry(T: ArrayLike | None) -> Float64 | None:
     """Return the pose (4, 4) of odometry; None where it is unknown."""
     if T is None:
         return None
-    poses: list[Any] = [T]
-    pose: Float64 = se3.check_poses(poses, where="T_odometry", count=1)[0]
-    return None if se3.is_unknown(pose) else pose
+    with suppress(TypeError, ValueError, OverflowError):
+        if np.shape(T) == (4, 4) and se3.is_unknown(T):
+            return None
+    return se3.check_pose(T, where="T_odometry")
 
 
 def _direction(gravity: ArrayLike | None) -> Float64 | None:

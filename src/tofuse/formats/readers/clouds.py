@@ -108,7 +108,7 @@ class XyzClouds(cloud_files.CloudReader):
 def xyz_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     """Read one file: lines of numbers, maybe after their count, names of columns and comments."""
     text = reading.read_text(path)
-    skip, names = _head(text)
+    skip, names = _head(text, path)
     table = tables.parse_numbers(text, path, skip=skip)
     if table.shape[1] < 3:
         raise InputError(
@@ -117,8 +117,10 @@ def xyz_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
             remedy="write x y z",
         )
     points, triples, scalars = table[:, :3], [], _fourth(table)
-    named = dict(zip(names, table.T, strict=False))
-    if len(named) == table.shape[1] and set("xyz") <= named.keys():
+    named: dict[str, Float64] = {}
+    for name, column in zip(names, table.T, strict=False):
+        named.setdefault(name, column)
+    if len(names) >= table.shape[1] and set("xyz") <= named.keys():
         # In the order of the file: surveyors' y and x, east and north, are right-handed so.
         points = np.stack([column for name, column in named.items() if name in "xyz"], 1)
         triples = [
@@ -143,19 +145,28 @@ def xyz_frame(path: Path, index: int, timestamp: float) -> CloudFrame:
     return cloud_files.cloud_frame(index, timestamp, cloud)
 
 
-def _head(text: str) -> tuple[int, list[str]]:
+def _head(text: str, path: Path) -> tuple[int, list[str]]:
     """The number of lines before those of numbers, and the names in the last one that is text.
 
-    The names are in small letters and without units.
+    The names are in small letters and without units. Columns with names that are not x, y and z,
+    such as an identifier, northing and easting, could be in any order.
     """
     names: list[str] = []
+    is_comment = False
     lines = tables.plain_nan("\n".join(text.split("\n", _HEAD_LINES)[:_HEAD_LINES])).split("\n")
     for k, line in enumerate(lines):
         cells = re.split(r"[\s,;]+", line.strip("#/,; \t\r"))
         if _is_number(cells[0]) and len(cells) > 1:
+            if len(names) == len(cells) and not is_comment and not set("xyz") <= set(names):
+                raise InputError(
+                    f"names its columns {', '.join(names)}",
+                    where=path,
+                    remedy="call those of the coordinates x, y and z in that line",
+                )
             return k, names
         if cells[0] and not _is_number(cells[0]):
-            names = [re.sub(r"\W.*", "", cell.strip('"').lower()) for cell in cells]
+            is_comment = line.lstrip()[0] in "#/;"
+            names = [re.sub(r"\W.*|_m$", "", cell.strip('"').lower()) for cell in cells]
     return 1, names
 
 

@@ -84,12 +84,14 @@ class _Scan:
 def _scans(path: Path) -> list[_Scan]:
     """The scans of a file, which follow each other."""
     scans: list[_Scan] = []
+    reading.read_head(path, 0)  # refuses what has no end: pipes, devices
     with reading.readable(path), path.open("rb") as file:
         lines = (line for line in file if line.strip())
         while (head := list(islice(lines, _HEADER_LINES))) or not scans:
             try:
                 columns, rows = int(head[0]), int(head[1])
-                if len(head) < _HEADER_LINES or not 1 <= columns <= _MAX_POINTS // max(rows, 1):
+                is_whole = len(head) == _HEADER_LINES and min(columns, rows) >= 1
+                if not is_whole or columns * rows > _MAX_POINTS:
                     raise ValueError
             except (IndexError, ValueError) as error:
                 raise InputError(

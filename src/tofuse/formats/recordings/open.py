@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -158,6 +159,9 @@ def open_recording(
         factor=factor,
     )
     shown_path = " ".join(map(str, paths))
+    for a, b in combinations(paths, 2):
+        if Path(a).resolve() == Path(b).resolve():
+            raise InputError("is given twice", where=b, remedy="pass each recording once")
     inner = [unzipped(path) for path in paths]
     options = ReaderOptions(None if camera is None else Path(camera), topic, factor)
     in_folder = rig_file_in(inner[0]) if rig is None and len(inner) == 1 else None
@@ -293,7 +297,7 @@ def _resolve(
         raise InputError(
             f"could be several formats ({evidence})",
             where=path,
-            remedy=f"use --format {' or '.join(confident)}",
+            remedy=f"use --format {' or '.join(confident)}, or pass its files, which are joined",
         )
     if not sniffs and (parts := _recordings_in(path, options)):
         return parts
@@ -659,7 +663,7 @@ def open_view(
     """
     path, index = split_name(name)
     if format is None and index is None and is_surface(Path(path)):
-        points = surface_points(read_surface(Path(path)), path)
+        points = surface_points(read_surface(Path(path)), path) * (factor or 1.0)
         return _checked(SingleView(name, path, "mesh", 0, CloudFrame.of(points)))
     recording = open_recording(path, format=format, camera=camera, topic=topic, factor=factor)
     count = len(recording)
