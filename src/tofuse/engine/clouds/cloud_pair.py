@@ -63,7 +63,7 @@ _MIN_SUPPORT = 1 / 3
 # Overlap of a turned pose before its alignment, relative to that of the pose, below which it is no
 # rival.
 _MIN_TURNED_OVERLAP = 0.5
-# Probability above which a pose is not searched again without free space.
+# Probability below which all proposals are aligned.
 _LIKELY = 0.7
 # Points that describe a cloud to find its symmetries, and number of its motions that are aligned.
 _SYMMETRY_POINTS, _MAX_SYMMETRIES = 1500, 6
@@ -144,12 +144,6 @@ class _CloudViews:
     def has_free_space(self) -> bool:
         """Whether the viewpoint, and so the free space, is known for both views."""
         return self.source_map.viewpoint is not None and self.target_map.viewpoint is not None
-
-    @property
-    def has_assumed_viewpoint(self) -> bool:
-        """Whether the free space of a view is that of a cloud whose viewpoint was detected."""
-        maps = (self.source, self.source_map), (self.target, self.target_map)
-        return any(m.viewpoint is not None and isinstance(v, CloudFrame) for v, m in maps)
 
     def without_free_space(self) -> _CloudViews:
         """Return the views without their viewpoints."""
@@ -283,25 +277,6 @@ def _registered(
     image_registration: Registration | None = None,
     *,
     always_search: bool = False,
-) -> Registration:
-    options = {"always_search": always_search}
-    registration = _registered_views(views, guess, image_registration, **options)
-    likely = (registration.probability or 0.0) > _LIKELY
-    if registration.believed or likely or not views.has_assumed_viewpoint:
-        return registration
-    other = _registered_views(views.without_free_space(), guess, image_registration, **options)
-    if other.believed:  # nothing shows which of the two is wrong: the pose or the viewpoint
-        reason = "its free space contradicts it, if a cloud was seen from its origin"
-        other = replace(other, believed=False, probability=_LIKELY, reason=reason)
-    return max(registration, other, key=lambda found: found.probability or 0.0)
-
-
-def _registered_views(
-    views: _CloudViews,
-    guess: Float64 | None,
-    image_registration: Registration | None,
-    *,
-    always_search: bool,
 ) -> Registration:
     start = np.eye(4) if guess is None else guess
     local = replace(views.refined(start), guess=start)

@@ -14,6 +14,7 @@ from tofuse.engine.alignment import Registrar, Registration, UncertaintyOptions
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds.cloud_pair import follow_clouds, register_clouds, with_cloud_information
 from tofuse.engine.clouds.fpfh import candidates
+from tofuse.engine.clouds.isolated import without_isolated
 from tofuse.engine.clouds.viewpoint import as_image, viewpoint_of
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
@@ -29,7 +30,7 @@ _RECORDED_VIEWS = UncertaintyOptions(hidden=0.01, offset=0.5, floor=0.006)
 # Maximum number of points of a cloud.
 _MAX_POINTS = 320_000
 # Cache: a view is registered to several others.
-_thinned_views: WeakKeyDictionary[Frame, Frame] = WeakKeyDictionary()
+_cleaned_views: WeakKeyDictionary[Frame, Frame] = WeakKeyDictionary()
 # Maximum number of poses proposed by feature matching, and of described points of a view.
 _PROPOSALS, _DESCRIBED_POINTS = 8, 1500
 
@@ -64,7 +65,7 @@ class AnyPair(Registrar):
                 raise RegistrationError(
                     f"has {quantities.count(len(view), 'point')}", where=f"frame {view.index}"
                 )
-        source, target = _thinned(source), _thinned(target)
+        source, target = _cleaned(source), _cleaned(target)
         searches = self.search or guess is None
         are_images = isinstance(source, RangeFrame) and isinstance(target, RangeFrame)
         # Other clouds are matched by features below.
@@ -83,16 +84,19 @@ class AnyPair(Registrar):
         return register_clouds(source, target, guess, rng, image_registration)
 
 
-def _thinned(view: Frame) -> Frame:
-    """Return a view with enough points for its registration; of larger clouds a random subset."""
-    if not isinstance(view, CloudFrame) or len(view) <= _MAX_POINTS:
+def _cleaned(view: Frame) -> Frame:
+    """Return a view without isolated points, and of larger clouds a random subset."""
+    if not isinstance(view, CloudFrame):
         return view
-    if view not in _thinned_views:
-        chosen = np.random.default_rng(0).choice(len(view), _MAX_POINTS, replace=False)
-        kept = np.zeros(len(view), bool)
-        kept[chosen] = True
-        _thinned_views[view] = view.keep(kept)
-    return _thinned_views[view]
+    if view not in _cleaned_views:
+        cleaned = view
+        if len(view) > _MAX_POINTS:
+            chosen = np.random.default_rng(0).choice(len(view), _MAX_POINTS, replace=False)
+            kept = np.zeros(len(view), bool)
+            kept[chosen] = True
+            cleaned = view.keep(kept)
+        _cleaned_views[view] = without_isolated(cleaned)
+    return _cleaned_views[view]
 
 
 def _feature_proposals(source: Frame, target: Frame) -> Float64:

@@ -1,0 +1,49 @@
+"""Points of a cloud that are on no surface, such as wrong ones of a stereo matcher.
+
+Averaging reduces surfaces to a few points, and leaves each of these as it is: a tenth of a cloud
+becomes half of its averaged points, and resolutions that are chosen by these get too coarse.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tofuse.engine.arrays import Bool, Float64
+from tofuse.engine.frames import CloudFrame
+from tofuse.engine.geometry import KdTree
+from tofuse.engine.icp.surface_shape import shape_at, tree_of
+
+# Points of a sample that decides whether there are many, and of those that tell which; neighbours.
+_FEW, _MANY, _NEIGHBOURS = 3000, 20_000, 12
+# Isolated points have neighbours this many times as far away as is usual, and these spread across
+# their plane by more than this fraction of their extent along it, as nearly all random points do.
+# What a scanner saw of distant surfaces is sparse as well, but plane.
+_MIN_DISTANCE, _MIN_ROUGHNESS = 3.0, 0.3
+# Share of isolated points below which they do no harm.
+_MAX_SHARE = 0.05
+# Without the first ones, others stand out more.
+_PASSES = 2
+
+
+def without_isolated(view: CloudFrame) -> CloudFrame:
+    """Return a cloud without isolated points; itself if it has few."""
+    if len(view) <= _NEIGHBOURS or _examined(view, _FEW)[1].mean() < _MAX_SHARE:
+        return view
+    for _ in range(_PASSES):
+        points, isolated, reach = _examined(view, _MANY)
+        nearest, distance = KdTree(points[~isolated]).nearest(view.points)
+        view = view.keep(distance <= reach[~isolated][nearest])
+    return view
+
+
+def _examined(view: CloudFrame, count: int) -> tuple[Float64, Bool, Float64]:
+    """Return a sample (n, 3), which of it is isolated, and squares of how far neighbours reach."""
+    chosen = np.arange(len(view))
+    if len(view) > count:
+        chosen = np.sort(np.random.default_rng(0).choice(len(view), count, replace=False))
+    sample = CloudFrame(view.index, view.timestamp, view.points[chosen])
+    shape = shape_at(sample, np.arange(len(sample)), _NEIGHBOURS)
+    reach = tree_of(sample).neighbours(sample.points, _NEIGHBOURS)[1][:, -1]
+    usual = np.median(reach[reach > 0]) if reach.any() else 0.0  # points may repeat
+    is_far = reach > _MIN_DISTANCE**2 * usual
+    return sample.points.astype(np.float64), is_far & (shape.roughness > _MIN_ROUGHNESS), reach
