@@ -30,7 +30,7 @@ from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp.coarse_to_fine import averaged
-from tofuse.engine.search.pose_probability import CLOUDS, CloudEvidence
+from tofuse.engine.search.pose_probability import ACCEPTED, CLOUDS, CloudEvidence
 from tofuse.engine.tracking.pairwise import Pairwise
 from tofuse.formats.geometry.ply import write_ply
 from tofuse.lab.simulation.effects import Effects
@@ -347,7 +347,7 @@ def test_clouds_of_different_density(scans):
 def test_views_without_overlap_are_rejected(scans):
     _, elsewhere = scan([2.5, -2.5, 1.3], 1.0, seed=3)
     for source, target, reason in (
-        (elsewhere, scans[1], "in another pose distinct surfaces coincide nearly as well"),
+        (elsewhere, scans[1], "another pose fits nearly as well"),
         (np.random.default_rng(0).normal(size=(3000, 3)), scans[1], "points of both views"),
     ):
         found = tofuse.register(source, target)
@@ -582,3 +582,17 @@ def test_candidates_of_same_pose_are_not_rivals():
     """With large noise, iterations stop slightly apart; such poses do not contradict each other."""
     views, _ = peaks_views(0.1, 101)
     assert register_clouds(views[1], views[0], None, np.random.default_rng(0)).probability > 0.5
+
+
+def test_pose_contradicted_by_assumed_free_space_is_not_accepted(monkeypatch) -> None:
+    """Either the pose is wrong, or the cloud was not seen from its origin."""
+    found = Registration(np.eye(4), True, 1, 1, 1, 0.0, 0.0, np.eye(6), believed=False)
+    of_views = iter(
+        (replace(found, probability=0.4), replace(found, believed=True, probability=0.95))
+    )
+    monkeypatch.setattr(cloud_pair, "_best", lambda *_: next(of_views))
+    monkeypatch.setattr(cloud_pair._CloudViews, "has_assumed_viewpoint", True)
+    chosen = tofuse.register(corner_of_a_room(12), corner_of_a_room(13))
+    assert not chosen.believed
+    assert chosen.probability < ACCEPTED
+    assert "its free space contradicts it" in chosen.reason

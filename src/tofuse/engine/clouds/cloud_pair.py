@@ -63,7 +63,7 @@ _MIN_SUPPORT = 1 / 3
 # Overlap of a turned pose before its alignment, relative to that of the pose, below which it is no
 # rival.
 _MIN_TURNED_OVERLAP = 0.5
-# Probability below which all proposals are aligned.
+# Probability below which all proposals are aligned, and evaluated again without free space.
 _LIKELY = 0.7
 # Points that describe a cloud to find its symmetries, and number of its motions that are aligned.
 _SYMMETRY_POINTS, _MAX_SYMMETRIES = 1500, 6
@@ -144,6 +144,12 @@ class _CloudViews:
     def has_free_space(self) -> bool:
         """Whether the viewpoint, and so the free space, is known for both views."""
         return self.source_map.viewpoint is not None and self.target_map.viewpoint is not None
+
+    @property
+    def has_assumed_viewpoint(self) -> bool:
+        """Whether the free space of a view is that of a cloud whose viewpoint was detected."""
+        maps = (self.source, self.source_map), (self.target, self.target_map)
+        return any(m.viewpoint is not None and isinstance(v, CloudFrame) for v, m in maps)
 
     def without_free_space(self) -> _CloudViews:
         """Return the views without their viewpoints."""
@@ -289,7 +295,17 @@ def _registered(
     proposed, found = _proposed(views, start, guessed=guess is not None)
     poses += proposed
     poses += [views.refined(T, settled=True) for T in _others(views, poses, found)]
-    return views.with_information(_best(views, poses, found, local, guess, certain))
+    registration = views.with_information(_best(views, poses, found, local, guess, certain))
+    likely = (registration.probability or 0.0) > _LIKELY
+    if registration.believed or likely or not views.has_assumed_viewpoint:
+        return registration
+    views = views.without_free_space()
+    poses = [replace(views.evaluated(p.T_target_source), guess=p.guess) for p in poses]
+    other = views.with_information(_best(views, poses, found, poses[0], guess, None))
+    if other.believed:  # nothing shows which of the two is wrong: the pose or the viewpoint
+        reason = "its free space contradicts it, if a cloud was seen from its origin"
+        other = replace(other, believed=False, probability=_LIKELY, reason=reason)
+    return max(registration, other, key=lambda found: found.probability or 0.0)
 
 
 def _others(views: _CloudViews, poses: list[_Pose], found: Proposals | None) -> Sequence[Float64]:
