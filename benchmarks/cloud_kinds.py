@@ -354,6 +354,22 @@ def _dragon(data: Path, max_pairs: int, _rng: np.random.Generator) -> Iterator[P
         yield Pair(found[angles[k]], found[angles[k + len(angles) // 2]], None)
 
 
+def _dragon_spoilt(data: Path, max_pairs: int, rng: np.random.Generator) -> Iterator[Pair]:
+    """Scans of the dragon 24 and 48 degrees apart, with random points in and around their boxes."""
+    pairs = list(_dragon(data, max_pairs, rng))[: 2 * max_pairs]
+    for percent in (10, 20, 50):
+        for pair in pairs:
+            clouds = [_spoilt(points, percent / 100, rng) for points in (pair.source, pair.target)]
+            yield Pair(*clouds, pair.true, scene=f"{percent} % random points")
+
+
+def _spoilt(points: Float64, share: float, rng: np.random.Generator) -> Float64:
+    """Points with random ones, as a share of them, in a box half as large again."""
+    low, high = points.min(0), points.max(0)
+    margin, count = 0.25 * (high - low), int(share * len(points))
+    return np.vstack([points, rng.uniform(low - margin, high + margin, (count, 3))])
+
+
 def fragments(split: str) -> Maker:
     """Fragments of the 3DMatch benchmark, the same number of pairs of each scene."""
 
@@ -450,6 +466,7 @@ KINDS = {
         Kind("symmetric", "symmetric bodies", _symmetric),
         Kind("3DMatch", "3DMatch", fragments("3DMatch"), fitted=False),
         Kind("3DLoMatch", "3DLoMatch", fragments("3DLoMatch"), fitted=False),
+        Kind("dragon-spoilt", "dragon, random points", _dragon_spoilt, fitted=False),
         Kind("fragments-apart", "3DMatch, apart", _fragments_apart, fitted=False),
     )
 }
