@@ -475,12 +475,13 @@ def _covariance(
     p: Float64, normals: Float64, n: Intp, noise: Float64, shared_m: float, diagonal: float
 ) -> Float64:
     """Return the covariance (K, K) of the deviations of places after the best fit, m^2."""
-    if not np.isfinite(shared_m):
+    variance = shared_m * shared_m  # inf where it is no number
+    if not np.isfinite(variance):
         return np.full((len(p), len(p)), np.inf)
     V = np.diag(noise)
     if shared_m > 0:
         distance = np.linalg.norm(p[:, None] - p, axis=2)
-        V += shared_m**2 * (normals @ normals.T) * np.exp(-distance / (_SHARED_LENGTH * diagonal))
+        V += variance * (normals @ normals.T) * np.exp(-distance / (_SHARED_LENGTH * diagonal))
     J, _ = _jacobian(p - p.mean(0), normals)
     weighted = J * n[:, None]
     A = _inverse(J.T @ weighted)[0] @ weighted.T
