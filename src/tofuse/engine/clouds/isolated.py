@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float64
 from tofuse.engine.frames import CloudFrame
 from tofuse.engine.geometry import KdTree
-from tofuse.engine.icp.surface_shape import shape_at, tree_of
+from tofuse.engine.icp import surface_shape
 
 # Points of a sample that decides whether there are many, and of those that tell which; neighbours.
 _FEW, _MANY, _NEIGHBOURS = 3000, 20_000, 12
@@ -21,19 +21,24 @@ _FEW, _MANY, _NEIGHBOURS = 3000, 20_000, 12
 _MIN_DISTANCE, _MIN_ROUGHNESS = 3.0, 0.3
 # Share of isolated points below which they do no harm.
 _MAX_SHARE = 0.05
-# Without the first ones, others stand out more.
-_PASSES = 2
 
 
 def without_isolated(view: CloudFrame) -> CloudFrame:
     """Return a cloud without isolated points; itself if it has few."""
     if len(view) <= _NEIGHBOURS or _examined(view, _FEW)[1].mean() < _MAX_SHARE:
         return view
-    for _ in range(_PASSES):
-        points, isolated, reach = _examined(view, _MANY)
-        nearest, distance = KdTree(points[~isolated]).nearest(view.points)
-        view = view.keep(distance <= reach[~isolated][nearest])
-    return view
+    cleaned = _reduced(view, _MAX_SHARE)
+    # Without the first ones, others stand out more.
+    return view if cleaned is view else _reduced(cleaned, 0.0)
+
+
+def _reduced(view: CloudFrame, min_share: float) -> CloudFrame:
+    """Return a cloud without points that stand out; itself if these are a smaller share."""
+    points, isolated, reach = _examined(view, _MANY)
+    if isolated.mean() < min_share:
+        return view
+    nearest, distance = KdTree(points[~isolated]).nearest(view.points)
+    return view.keep(distance <= reach[~isolated][nearest])
 
 
 def _examined(view: CloudFrame, count: int) -> tuple[Float64, Bool, Float64]:
@@ -42,8 +47,8 @@ def _examined(view: CloudFrame, count: int) -> tuple[Float64, Bool, Float64]:
     if len(view) > count:
         chosen = np.sort(np.random.default_rng(0).choice(len(view), count, replace=False))
     sample = CloudFrame(view.index, view.timestamp, view.points[chosen])
-    shape = shape_at(sample, np.arange(len(sample)), _NEIGHBOURS)
-    reach = tree_of(sample).neighbours(sample.points, _NEIGHBOURS)[1][:, -1]
+    shape = surface_shape.shape_at(sample, np.arange(len(sample)), _NEIGHBOURS)
+    reach = surface_shape.tree_of(sample).neighbours(sample.points, _NEIGHBOURS)[1][:, -1]
     usual = np.median(reach[reach > 0]) if reach.any() else 0.0  # points may repeat
     is_far = reach > _MIN_DISTANCE**2 * usual
     return sample.points.astype(np.float64), is_far & (shape.roughness > _MIN_ROUGHNESS), reach
