@@ -1,5 +1,8 @@
 """Points on no surface."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 
@@ -64,3 +67,13 @@ def test_clean_clouds_stay_as_they_are() -> None:
     for points in (near, np.vstack([near, far]), repeated, near[:5], np.zeros((50, 3))):
         view = CloudFrame.of(points)
         assert without_isolated(view) is view
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_registered_clouds_are_not_kept_in_memory(share) -> None:
+    views = [CloudFrame.of(spoilt(corner(seed), share, seed)) for seed in (1, 2)]
+    known = [weakref.ref(view) for view in views]
+    tofuse.register(*views, guess=np.eye(4))
+    del views
+    gc.collect()
+    assert [ref() for ref in known] == [None, None]

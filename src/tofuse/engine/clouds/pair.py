@@ -29,8 +29,8 @@ MIN_POINTS = 10
 _RECORDED_VIEWS = UncertaintyOptions(hidden=0.01, offset=0.5, floor=0.006)
 # Maximum number of points of a cloud.
 _MAX_POINTS = 320_000
-# Cache: a view is registered to several others.
-_cleaned_views: WeakKeyDictionary[Frame, Frame] = WeakKeyDictionary()
+# Cache: a view is registered to several others; None of one that stays as it is.
+_cleaned_views: WeakKeyDictionary[Frame, Frame | None] = WeakKeyDictionary()
 # Maximum number of poses proposed by feature matching, and of described points of a view.
 _PROPOSALS, _DESCRIBED_POINTS = 8, 1500
 
@@ -95,8 +95,10 @@ def _cleaned(view: Frame) -> Frame:
             kept = np.zeros(len(view), bool)
             kept[chosen] = True
             cleaned = view.keep(kept)
-        _cleaned_views[view] = without_isolated(cleaned)
-    return _cleaned_views[view]
+        cleaned = without_isolated(cleaned)
+        _cleaned_views[view] = None if cleaned is view else cleaned
+    found = _cleaned_views[view]
+    return view if found is None else found
 
 
 def _feature_proposals(source: Frame, target: Frame) -> Float64:
