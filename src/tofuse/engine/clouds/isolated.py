@@ -41,12 +41,18 @@ def _reduced(view: CloudFrame, min_share: float) -> CloudFrame:
     return view.keep(distance <= reach[~isolated][nearest])
 
 
+def sampled(view: CloudFrame, count: int) -> CloudFrame:
+    """Return a random subset of the points, in their order; the view itself if it has no more."""
+    if len(view) <= count:
+        return view
+    kept = np.zeros(len(view), bool)
+    kept[np.random.default_rng(0).choice(len(view), count, replace=False)] = True
+    return view.keep(kept)
+
+
 def _examined(view: CloudFrame, count: int) -> tuple[Float64, Bool, Float64]:
     """Return a sample (n, 3), which of it is isolated, and squares of how far neighbours reach."""
-    chosen = np.arange(len(view))
-    if len(view) > count:
-        chosen = np.sort(np.random.default_rng(0).choice(len(view), count, replace=False))
-    sample = CloudFrame(view.index, view.timestamp, view.points[chosen])
+    sample = sampled(view, count)
     shape = surface_shape.shape_at(sample, np.arange(len(sample)), _NEIGHBOURS)
     reach = surface_shape.tree_of(sample).neighbours(sample.points, _NEIGHBOURS)[1][:, -1]
     usual = np.median(reach[reach > 0]) if reach.any() else 0.0  # points may repeat

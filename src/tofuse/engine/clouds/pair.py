@@ -14,7 +14,7 @@ from tofuse.engine.alignment import Registrar, Registration, UncertaintyOptions
 from tofuse.engine.arrays import Float64
 from tofuse.engine.clouds.cloud_pair import follow_clouds, register_clouds, with_cloud_information
 from tofuse.engine.clouds.fpfh import candidates
-from tofuse.engine.clouds.isolated import without_isolated
+from tofuse.engine.clouds.isolated import sampled, without_isolated
 from tofuse.engine.clouds.viewpoint import as_image, viewpoint_of
 from tofuse.engine.errors import RegistrationError
 from tofuse.engine.frames import CloudFrame, Frame, RangeFrame
@@ -89,13 +89,7 @@ def _cleaned(view: Frame) -> Frame:
     if not isinstance(view, CloudFrame):
         return view
     if view not in _cleaned_views:
-        cleaned = view
-        if len(view) > _MAX_POINTS:
-            chosen = np.random.default_rng(0).choice(len(view), _MAX_POINTS, replace=False)
-            kept = np.zeros(len(view), bool)
-            kept[chosen] = True
-            cleaned = view.keep(kept)
-        cleaned = without_isolated(cleaned)
+        cleaned = without_isolated(sampled(view, _MAX_POINTS))
         _cleaned_views[view] = None if cleaned is view else cleaned
     found = _cleaned_views[view]
     return view if found is None else found
