@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from tofuse.engine.alignment import Link, Registration
-from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.connections import parts_of
 from tofuse.engine.geometry import retract, se3, twist_between
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
@@ -77,6 +77,28 @@ class TrackedComponent:
     def depth(self) -> float:
         """Median depth of its views, m."""
         return float(np.median([v.depth for v in self.views])) if self.views else 1.0
+
+    def part(self, chosen: Bool) -> TrackedComponent:
+        """Return the component without some of its frames (N,), but with all of its views."""
+        odometry = None if self.odometry is None else self.odometry[chosen]
+        frames, times, poses = self.frames[chosen], self.times[chosen], self.poses[chosen]
+        return replace(self, frames=frames, times=times, poses=poses, odometry=odometry)
+
+
+def successions(
+    a: TrackedComponent, b: TrackedComponent
+) -> Iterator[tuple[TrackedComponent, TrackedComponent]]:
+    """Yield the frames of the earlier component up to where the other one follows, and those after.
+
+    Several times if one was joined across the other before.
+    """
+    frames = np.concatenate([a.frames, b.frames])
+    order = np.argsort(frames)
+    is_b = order >= len(a.frames)
+    for k in np.flatnonzero(is_b[1:] != is_b[:-1]).tolist():
+        before, after = (b, a) if is_b[k] else (a, b)
+        last = frames[order[k]]
+        yield before.part(before.frames <= last), after.part(after.frames > last)
 
 
 def motion_over(
@@ -354,11 +376,11 @@ class MergedComponents:
     def of_same_recording(
         self, a: MergedComponent, b: MergedComponent
     ) -> Iterator[tuple[TrackedComponent, TrackedComponent]]:
-        """Yield pairs of tracked components of one recording, the earlier one first."""
+        """Yield where tracked components of one recording follow each other, see `successions`."""
         for c, d in itertools.product(a.T, b.T):
             first, second = self.tracked[c], self.tracked[d]
             if first.recording == second.recording:
-                yield (first, second) if first.frames[0] < second.frames[0] else (second, first)
+                yield from successions(first, second)
 
     def positions(self, a: MergedComponent, b: MergedComponent) -> tuple[int, int]:
         """Return the positions of two merged components, ascending."""
