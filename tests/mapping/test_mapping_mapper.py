@@ -424,6 +424,21 @@ def test_temporal_filters_see_raw_neighbours_of_selected_frames(recording, frame
     assert [f.index for f in result.diagnostics.frames] == [0, 3, 6]
 
 
+def test_another_recording_has_no_neighbours_in_the_one_before(frames) -> None:
+    """Nor do its times, or a first image that equals the last one, mean anything there."""
+    SeesHistory.seen.clear()
+    mapper = Mapper(replace(CONFIG, filters=(SeesHistory(),)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for k in (0, 1):
+            mapper.push(replace(frames[k], timestamp=100 + 0.1 * k))
+        mapper.interrupt()
+        for index, k in ((2, 1), (3, 2)):
+            mapper.push(replace(frames[k], index=index, timestamp=0.1 * index))
+    assert [past for _, past, _ in SeesHistory.seen] == [[], [0], [], [2]]
+    assert not mapper.log.repeated
+
+
 def test_unreadable_neighbours_are_left_out(room_recording, tmp_path) -> None:
     copy = shutil.copytree(room_recording, tmp_path / "copy")
     (copy / "depth" / "000002.png").write_bytes(b"no image")

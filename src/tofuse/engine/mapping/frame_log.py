@@ -89,6 +89,11 @@ class FrameSequence:
         self._index = index
         self.kind = self.kind or kind
 
+    def interrupt(self) -> None:
+        """Begin another recording, whose clock and images are others than those before."""
+        self._previous = None
+        self._times = None if self._times is None else []
+
     def is_repeated(self, frame: Frame) -> bool:
         """Whether an image equals the previous one: the camera is stuck, as noise never repeats."""
         if not isinstance(frame, RangeFrame):

@@ -280,7 +280,8 @@ class Mapper:
         self._check_open()
         if self._log.entries:
             self._log.interruptions.append(len(self._log.entries))
-        self._tracker.interrupt()
+        for part in (self._tracker, self._preparation, self._sequence):
+            part.interrupt()
         if config is not None:
             self._preparation = Preparation(config, self._preparation.counts)
             self._tracker = config.odometry.start(self.seed, config.search)
