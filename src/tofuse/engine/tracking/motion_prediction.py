@@ -235,7 +235,9 @@ def _of_speed(even: Float64, speed: float, turn: float) -> Float64:
 def with_prediction(
     information: Float64, unobservable: Float64, sigma: tuple[float, float]
 ) -> Float64:
-    """Add the information of the prediction in degenerate directions to that of a registration.
+    """Return the information of a registration, with that of the prediction along degenerate axes.
+
+    There it replaces the prior of the alignment, which is that of any prediction.
 
     Parameters
     ----------
@@ -250,7 +252,7 @@ def with_prediction(
         return information
     basis, _ = np.linalg.qr((unobservable / projective.UNITS).T)
     variance = (np.repeat(sigma, 3) / projective.UNITS) ** 2
-    prior_information = basis @ np.linalg.inv(basis.T @ (variance[:, None] * basis)) @ basis.T
-    return np.asarray(
-        information + prior_information / np.outer(projective.UNITS, projective.UNITS), np.float64
-    )
+    units = np.outer(projective.UNITS, projective.UNITS)
+    predicted = basis @ np.linalg.inv(basis.T @ (variance[:, None] * basis)) @ basis.T
+    measured = projective.with_free_directions(information * units, basis)
+    return np.asarray((measured + predicted) / units, np.float64)
