@@ -25,8 +25,10 @@ from tofuse.engine.mapping.config import changed
 from tofuse.engine.mapping.frame_log import FrameSequence
 from tofuse.engine.mapping.mapper import Mapper
 from tofuse.engine.mapping.methods import from_method
+from tofuse.engine.mapping.preparation import Preparation
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.parts import part
+from tofuse.engine.tracking.base import Step, Tracker
 from tofuse.lab.methods.filters_temporal import TemporalDeviation
 
 # Fine enough for few frames, and fast.
@@ -358,6 +360,25 @@ def test_given_tracker_tracks_clouds_too(frames) -> None:
     for cloud in clouds:
         mapper.push(cloud)
     assert given.pushed == 2
+
+
+def test_lost_frame_begins_no_component(frames, monkeypatch) -> None:
+    """The maps of corrections, as of indirect light, are of the component before and after it."""
+    steps = [Step("tracked", "", np.eye(4), component=c) for c in (0, 1, 1)]
+    steps.insert(2, Step("lost", "dark", None))
+    begun: list[int] = []
+    monkeypatch.setattr(Preparation, "begin_component", lambda _: begun.append(len(pushed)))
+    pushed: list[int] = []
+
+    class Scripted(Tracker):
+        def push(self, frame, T_odometry=None, surface=None):
+            pushed.append(frame.index)
+            return steps[len(pushed) - 1]
+
+    mapper = Mapper(CONFIG, tracker=Scripted())
+    for frame in frames[:4]:
+        mapper.push(frame)
+    assert begun == [2]
 
 
 def test_covariances_are_relative_to_first_pose(whole) -> None:
