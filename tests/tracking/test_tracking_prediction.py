@@ -86,6 +86,15 @@ def test_degenerate_directions_are_excluded() -> None:
     assert found.sigma[0] == pytest.approx(ignored.sigma[0] * np.sqrt(3 / 2), rel=1e-3)
 
 
+def test_without_constrained_motion_error_is_half_of_the_rms_motion() -> None:
+    """Along each axis, though the camera moves along one of them, and not all the time."""
+    motions = np.zeros((40, 6))
+    motions[::4, 0], motions[:, 4] = 0.06, 0.02
+    found = Prediction.of(path(motions), [np.eye(6)] * 41)
+    assert found.sigma[0] == pytest.approx(0.5 * 0.06 / np.sqrt(4 * 3), rel=1e-3)
+    assert found.sigma[1] == pytest.approx(0.5 * 0.02 / np.sqrt(3), rel=1e-3)
+
+
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 5])
 def test_few_poses_give_default_growth(n) -> None:
     found = Prediction.of(path(np.full((n, 6), 0.1))[:n], [NONE] * n)

@@ -58,7 +58,7 @@ class Prediction:
     def of(cls, poses: Float64, unobservable: Sequence[Float64]) -> Prediction:
         """Estimate it from the constrained motions of a recording.
 
-        If too few directions were constrained, sigma is half of the typical motion.
+        If too few directions were constrained, sigma is half of the rms motion.
 
         Parameters
         ----------
@@ -70,7 +70,8 @@ class Prediction:
         if len(poses) < 3:
             return cls((0.1, 0.1))
         motions = se3.inverse(poses[:-1]) @ poses[1:]
-        typical = np.sqrt((se3.log(motions) / projective.UNITS).reshape(-1, 2, 3) ** 2).mean((0, 2))
+        squares = (se3.log(motions) / projective.UNITS).reshape(-1, 2, 3) ** 2
+        typical = np.sqrt(squares.mean((0, 2)))
         rms, enough = _errors(poses, motions, unobservable, 1)
         sigma = np.maximum(np.where(enough, rms, _MOTION_FRACTION * typical), _MIN_SIGMA)
         power = (_DEFAULT_POWER, _DEFAULT_POWER)
