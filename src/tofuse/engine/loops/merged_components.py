@@ -60,7 +60,8 @@ class TrackedComponent:
     views
         The stored views of its frames.
     recording
-        Number of its recording, if several are merged: no motion is known between these.
+        Number of its recording, or (N,) of that of each frame, if several are merged: no motion is
+        known between these.
     odometry
         (N, 4, 4) T_odometry_camera by external odometry, NaN where there is none; None without any.
     """
@@ -70,7 +71,7 @@ class TrackedComponent:
     times: Float64
     poses: Float64
     views: tuple[View, ...]
-    recording: int = 0
+    recording: int | Intp = 0
     odometry: Float64 | None = None
 
     @cached_property
@@ -78,11 +79,22 @@ class TrackedComponent:
         """Median depth of its views, m."""
         return float(np.median([v.depth for v in self.views])) if self.views else 1.0
 
+    @cached_property
+    def recordings(self) -> Intp:
+        """(N,) number of the recording of each frame."""
+        return np.broadcast_to(np.asarray(self.recording, np.intp), self.frames.shape)
+
     def part(self, chosen: Bool) -> TrackedComponent:
         """Return the component without some of its frames (N,), but with all of its views."""
         odometry = None if self.odometry is None else self.odometry[chosen]
-        frames, times, poses = self.frames[chosen], self.times[chosen], self.poses[chosen]
-        return replace(self, frames=frames, times=times, poses=poses, odometry=odometry)
+        return replace(
+            self,
+            frames=self.frames[chosen],
+            times=self.times[chosen],
+            poses=self.poses[chosen],
+            recording=self.recordings[chosen],
+            odometry=odometry,
+        )
 
 
 def successions(
@@ -90,12 +102,14 @@ def successions(
 ) -> Iterator[tuple[TrackedComponent, TrackedComponent]]:
     """Yield the frames of the earlier component up to where the other one follows, and those after.
 
-    Several times if one was joined across the other before.
+    Several times if one was joined across the other before; but not between two recordings.
     """
     frames = np.concatenate([a.frames, b.frames])
     order = np.argsort(frames)
     is_b = order >= len(a.frames)
-    for k in np.flatnonzero(is_b[1:] != is_b[:-1]).tolist():
+    recordings = np.concatenate([a.recordings, b.recordings])[order]
+    follows = (is_b[1:] != is_b[:-1]) & (recordings[1:] == recordings[:-1])
+    for k in np.flatnonzero(follows).tolist():
         before, after = (b, a) if is_b[k] else (a, b)
         last = frames[order[k]]
         yield before.part(before.frames <= last), after.part(after.frames > last)
@@ -119,7 +133,8 @@ def end_speeds(component: TrackedComponent, *, end: bool) -> Float64:
     if len(poses) < 2:
         return np.zeros((0, 2))
     elapsed = np.maximum(np.diff(times), 1e-9)
-    return se3.lengths(se3.inverse(poses[:-1]) @ poses[1:]) / elapsed[:, None]
+    speeds = se3.lengths(se3.inverse(poses[:-1]) @ poses[1:]) / elapsed[:, None]
+    return speeds[np.diff(component.recordings[window]) == 0]
 
 
 def largest_motion(before: TrackedComponent, after: TrackedComponent) -> Float64:
@@ -378,9 +393,7 @@ class MergedComponents:
     ) -> Iterator[tuple[TrackedComponent, TrackedComponent]]:
         """Yield where tracked components of one recording follow each other, see `successions`."""
         for c, d in itertools.product(a.T, b.T):
-            first, second = self.tracked[c], self.tracked[d]
-            if first.recording == second.recording:
-                yield from successions(first, second)
+            yield from successions(self.tracked[c], self.tracked[d])
 
     def positions(self, a: MergedComponent, b: MergedComponent) -> tuple[int, int]:
         """Return the positions of two merged components, ascending."""

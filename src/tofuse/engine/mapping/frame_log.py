@@ -270,7 +270,7 @@ class FrameLog:
                     np.array([e.record.timestamp for e in entries]),
                     np.array(poses),
                     tuple(v for v in views.views if v.component == component),
-                    entries[0].recording,
+                    np.array([e.recording for e in entries], np.intp),
                     _odometry(entries),
                 )
             )
