@@ -114,6 +114,17 @@ def test_arrays_in_memory_are_not_one_recording(room_result, tmp_path) -> None:
     assert len(loaded_sessions(folders, Silent())) == 2
 
 
+def test_folders_of_the_same_name_are_other_sessions(room_result, tmp_path) -> None:
+    parents = [tmp_path / name for name in ("monday/results", "tuesday/results", "wednesday")]
+    folders = [shutil.copytree(room_result, parent / "a") for parent in parents]
+    folders.append(shutil.copytree(room_result, parents[0] / "b"))
+    for folder in folders:
+        facts = {"path": "arrays", "format": "arrays", "frames": 3, "opening": None}
+        change_run(folder, input=facts)
+    found = [session.session for session in loaded_sessions(folders, Silent())]
+    assert found == [str(parents[0]), str(parents[1]), "wednesday", str(parents[0])]
+
+
 def test_a_single_result_is_refused(tmp_path) -> None:
     with pytest.raises(InputError, match="two or more"):
         loaded_sessions([tmp_path], Silent())

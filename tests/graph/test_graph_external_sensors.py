@@ -227,7 +227,8 @@ def test_odometry_errors_are_estimated_from_constrained_motion():
 
 
 @pytest.mark.parametrize(
-    ("factor", "motion", "metric"), [(1.0, 1.0, True), (0.5, 1.0, False), (1.0, 0.01, False)]
+    ("factor", "motion", "metric"),
+    [(1.0, 1.0, True), (0.5, 1.0, False), (1.0, 0.05, False), (1.0, 0.01, False)],
 )
 def test_odometry_verifies_depth_unit(factor, motion, metric):
     """If the camera moved, and its tracked path is as long as that of the odometry."""

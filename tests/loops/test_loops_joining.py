@@ -267,6 +267,37 @@ def test_equal_timestamps_say_nothing_of_the_gap(three) -> None:
     assert not checks.is_near(*merged.all, T, MAX_OVERLAP_DISTANCE)
 
 
+def test_component_may_lie_between_the_frames_of_another() -> None:
+    """As in earlier results: what was joined around it is one component."""
+    around, inside = stretch(0, [*range(14), *range(24, 38)]), stretch(1, range(15, 23))
+    merged = MergedComponents([around, inside])
+    checks = JoinChecks(merged)
+    a, b = merged.all
+    right = se3.inverse(PATH[0]) @ PATH[15]
+    assert checks.reachable(a, b, right)
+    assert checks.reachable(b, a, se3.inverse(right))
+    assert checks.is_near(a, b, right, MAX_OVERLAP_DISTANCE)
+    aside = right @ se3.exp([0, 0, -4.0, 0, 1.5, 0])
+    assert not checks.reachable(a, b, aside)
+    assert not checks.is_near(a, b, aside, MAX_OVERLAP_DISTANCE)
+
+
+def test_component_of_several_recordings_constrains_motion_within_each() -> None:
+    """As in earlier merges; the frames of the second one follow those of the other component."""
+    both = stretch(0, [*range(14), *range(24, 38)])
+    recording = np.repeat([0, 1], 14)
+    both = replace(both, recording=recording, times=both.times - 100.0 * recording)
+    merged = MergedComponents([both, stretch(1, range(15, 23))])
+    checks = JoinChecks(merged)
+    a, b = merged.all
+    assert checks.reachable(a, b, se3.inverse(PATH[0]) @ PATH[15])
+    elsewhere = se3.translation([0, 0, 40.0])
+    second = replace(merged.tracked[1], recording=1)
+    later = replace(second, times=second.times - 100.0)
+    checks = JoinChecks(merged := MergedComponents([both, later]))
+    assert not checks.reachable(*merged.all, elsewhere)
+
+
 def test_motion_between_recordings_is_unconstrained() -> None:
     path, parts, link = turned_back(0.0)
     (group,) = BY_LINKS.join([parts[0], replace(parts[1], recording=1)], [link])

@@ -11,6 +11,7 @@ import pytest
 
 from corner_views import corner
 from revisited_path import Drifting, away_and_back
+from tofuse.engine.alignment.base import Link, Registration
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import LoopRecord
 from tofuse.engine.graph.levenberg import LevenbergMarquardt
@@ -126,6 +127,74 @@ class _AlwaysClosing:
     def detection_job(self):
         record = LoopRecord(0, 1, True, "")
         return lambda: [ClosedLoop(record, np.eye(4), np.eye(6))]
+
+
+class _Shorter:
+    """Loops between the first frame of a walk and its sixth: the way is 10 % shorter."""
+
+    def __init__(self, first):
+        self.first, self.asked = first, first - 1
+
+    def detection_job(self):
+        self.asked += 1
+        if self.asked != self.first + 5:
+            return None
+        record = LoopRecord(self.first, self.asked, True, "")
+        return lambda: [ClosedLoop(record, se3.translation([0.45, 0, 0]), 1e8 * np.eye(6))]
+
+
+AHEAD = se3.translation([0.1, 0, 0])
+
+
+def measured(information=1e4):
+    return Registration(AHEAD, True, 1, 1, 1, 0.0, 0.0, information * np.eye(6))
+
+
+class Walk:
+    """Frames that are 0.1 m apart, by the tracker; `poses` are the reported ones."""
+
+    def __init__(self, loops):
+        self.live, self.log = LivePoses(loops, LevenbergMarquardt()), FrameLog()
+        self.poses = []
+
+    def step(self, step):
+        index = len(self.log.entries)
+        self.log.add(FrameRecord(index, float(index), step.status, ""), step)
+        self.live.update(step, self.log)
+        self.poses.append(self.live.pose(step))
+
+    def go(self, count, component=0, link=None):
+        begin = len(self.log.entries)
+        for k in range(count):
+            T = se3.translation([0.1 * k, 0, 0])
+            links = () if k or link is None else (Link(link, begin, measured(), True, ""),)
+            reference, registration = (begin + k - 1, measured()) if k else (None, None)
+            self.step(Step("tracked", "", T, reference, registration, None, component, links))
+
+
+def test_next_component_begins_where_loops_put_the_last_frame():
+    walk = Walk(_Shorter(0))
+    walk.go(DELAY + 8)
+    walk.go(1, component=1, link=DELAY + 7)
+    *_, last, first = walk.poses
+    assert last[0, 3] < 0.1 * (DELAY + 7) - 0.04
+    np.testing.assert_allclose(first, last @ AHEAD, atol=1e-9)
+    # What was before the loop has another correction.
+    walk.go(1, component=2, link=0)
+    np.testing.assert_allclose(walk.poses[-1], AHEAD, atol=1e-9)
+
+
+def test_lost_frame_leaves_closed_loops_in_effect():
+    walk = Walk(_Shorter(1))
+    walk.go(1)
+    walk.go(DELAY + 8, component=1, link=0)
+    before = walk.poses[-1]
+    assert before[0, 3] < 0.1 * (DELAY + 8) - 0.04
+    walk.step(Step("lost", "dark", None))
+    T = walk.log.step_of(DELAY + 8).T_component_camera @ AHEAD
+    walk.step(Step("tracked", "", T, DELAY + 8, measured(), None, 1))
+    assert walk.poses[-2] is None
+    np.testing.assert_allclose(walk.poses[-1], before @ AHEAD, atol=1e-9)
 
 
 def test_long_graphs_are_solved_less_often():

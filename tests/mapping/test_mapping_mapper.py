@@ -25,8 +25,10 @@ from tofuse.engine.mapping.config import changed
 from tofuse.engine.mapping.frame_log import FrameSequence
 from tofuse.engine.mapping.mapper import Mapper
 from tofuse.engine.mapping.methods import from_method
+from tofuse.engine.mapping.preparation import Preparation
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.parts import part
+from tofuse.engine.tracking.base import Step, Tracker
 from tofuse.lab.methods.filters_temporal import TemporalDeviation
 
 # Fine enough for few frames, and fast.
@@ -360,6 +362,25 @@ def test_given_tracker_tracks_clouds_too(frames) -> None:
     assert given.pushed == 2
 
 
+def test_lost_frame_begins_no_component(frames, monkeypatch) -> None:
+    """The maps of corrections, as of indirect light, are of the component before and after it."""
+    steps = [Step("tracked", "", np.eye(4), component=c) for c in (0, 1, 1)]
+    steps.insert(2, Step("lost", "dark", None))
+    begun: list[int] = []
+    monkeypatch.setattr(Preparation, "begin_component", lambda _: begun.append(len(pushed)))
+    pushed: list[int] = []
+
+    class Scripted(Tracker):
+        def push(self, frame, T_odometry=None, surface=None):
+            pushed.append(frame.index)
+            return steps[len(pushed) - 1]
+
+    mapper = Mapper(CONFIG, tracker=Scripted())
+    for frame in frames[:4]:
+        mapper.push(frame)
+    assert begun == [2]
+
+
 def test_covariances_are_relative_to_first_pose(whole) -> None:
     first, second, *_, last = whole.diagnostics.frames
     np.testing.assert_array_equal(first.covariance, 0)
@@ -422,6 +443,21 @@ def test_temporal_filters_see_raw_neighbours_of_selected_frames(recording, frame
     for _, past, counts in SeesHistory.seen:
         assert counts == [len(frames[k]) for k in past]  # unfiltered
     assert [f.index for f in result.diagnostics.frames] == [0, 3, 6]
+
+
+def test_another_recording_has_no_neighbours_in_the_one_before(frames) -> None:
+    """Nor do its times, or a first image that equals the last one, mean anything there."""
+    SeesHistory.seen.clear()
+    mapper = Mapper(replace(CONFIG, filters=(SeesHistory(),)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for k in (0, 1):
+            mapper.push(replace(frames[k], timestamp=100 + 0.1 * k))
+        mapper.interrupt()
+        for index, k in ((2, 1), (3, 2)):
+            mapper.push(replace(frames[k], index=index, timestamp=0.1 * index))
+    assert [past for _, past, _ in SeesHistory.seen] == [[], [0], [], [2]]
+    assert not mapper.log.repeated
 
 
 def test_unreadable_neighbours_are_left_out(room_recording, tmp_path) -> None:

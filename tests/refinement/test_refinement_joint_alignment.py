@@ -22,7 +22,13 @@ from tofuse.engine.refinement.joint_alignment import (
     support_fell,
     support_of,
 )
-from tofuse.engine.refinement.refinement import Joint, NoRefinement, propagate_poses, without_errors
+from tofuse.engine.refinement.refinement import (
+    Joint,
+    NoRefinement,
+    propagate_poses,
+    with_unsupported_views_fixed,
+    without_errors,
+)
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
 from tofuse.engine.stored_views.view_store import SampledView, Spacing, ViewStore, overlaps
 from tofuse.engine.views.prepared_view import prepare_view
@@ -205,6 +211,20 @@ def test_view_that_loses_support_stays_with_neighbours():
     found = refiner(Joint(), views, drifted(truth))
     others = np.delete(np.arange(12), 6)
     assert away(found.poses[others], truth[others]) < 0.012
+
+
+def test_first_view_stays_though_it_lost_support():
+    """It is not at the origin where the first frame has no stored view."""
+    before = se3.exp(np.arange(1, 4)[:, None] * np.array([0.3, 0.1, 0, 0, 0.2, 0]))
+    after = before @ se3.exp(np.array([[0] * 6, [0.01] * 6, [0.02] * 6]))
+    lost = np.array([True, False, False])
+    out = with_unsupported_views_fixed(before, after, lost)
+    np.testing.assert_allclose(out[0], before[0], atol=1e-12)
+    np.testing.assert_allclose(
+        se3.inverse(out[0]) @ out[1], se3.inverse(before[0]) @ before[1], atol=1e-12
+    )
+    motion = se3.inverse(after[1]) @ after[2]
+    np.testing.assert_allclose(se3.inverse(out[1]) @ out[2], motion, atol=1e-12)
 
 
 def test_pairs_of_a_view_do_not_accumulate_information():

@@ -9,6 +9,7 @@ from tofuse.engine.compute.thread_pool import threads
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph import build_graph, external_sensors
+from tofuse.engine.refinement import plane_kernels
 from tofuse.engine.refinement.common_planes import refine_clouds
 from tofuse.engine.refinement.plane_refinement import Planes
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
@@ -131,3 +132,41 @@ def test_clouds_in_the_coordinates_of_a_site_take_part():
         for v, T in zip(views[:4], truth, strict=False)
     ]
     assert refined(Planes(), placed, np.tile(np.eye(4), (4, 1, 1))).views == 4
+
+
+def boxes_with_strays(count: int) -> tuple[list[np.ndarray], np.ndarray]:
+    """Noisy points on the walls of a room, and stray ones in it, as seen from nudged poses."""
+    rng = np.random.default_rng(0)
+    half = np.array([3.0, 2.0, 1.5])
+    poses = nudged(np.tile(np.eye(4), (count, 1, 1)), 0.2)
+    clouds = []
+    for T in poses:
+        walls, strays = rng.uniform(-half, half, (600, 3)), rng.uniform(-half, half, (160, 3))
+        wall = np.arange(600) % 3
+        walls[np.arange(600), wall] = half[wall] * rng.choice([-1, 1], 600)
+        walls += rng.normal(0, 0.004, walls.shape)
+        clouds.append(se3.transform(se3.inverse(T), np.concatenate([walls, strays])))
+    return clouds, nudged(poses, 0.02, seed=1)
+
+
+def test_result_does_not_depend_on_the_origin():
+    """Nor do cells of so few points that they have no plane."""
+    clouds, start = boxes_with_strays(4)
+    here = refine_clouds(clouds, start)
+    assert here.size > 0
+    moved = se3.translation([1.5, 1.0, 0.5])
+    there = refine_clouds(clouds, moved @ start)
+    np.testing.assert_allclose(se3.inverse(moved) @ there.poses, here.poses, atol=1e-6)
+    np.testing.assert_allclose(there.after, here.after, atol=1e-6)
+
+
+def test_points_without_a_plane_are_no_support():
+    x, view = np.array([[1.0, 2.0, 3.0], [1.1, 2.0, 3.0], [1.2, 2.2, 3.0]]), np.array([0, 0, 1])
+    start, views = np.array([0, 3]), np.empty(1, np.int64)
+    mean, axes, variances = np.empty((1, 3)), np.empty((1, 3, 3)), np.empty((1, 3))
+    plane_kernels.fit_cells(x, view, start, mean, axes, variances, views)
+    np.testing.assert_allclose(mean[0], x.mean(0))
+    support = np.zeros(2)
+    plane_kernels.plane_support(x, view, start, mean, axes, views, 0.01, support)
+    assert views[0] == 2
+    assert not support.any()

@@ -72,6 +72,17 @@ def test_interruption_resets_predicted_motion() -> None:
     np.testing.assert_allclose(method.guesses, [0.0, 0.1, 0.0], atol=1e-9)
 
 
+def test_odometry_of_another_recording_is_in_another_frame() -> None:
+    method = Scripted(motions=(0.0, 0.1, 0.1, 0.1))
+    tracker = Pairwise(registration=method, guess="odometry").start(0)
+    points = np.zeros((40, 3), np.float32)
+    for k, x in enumerate((0.0, 0.1, 7.0, 7.1)):
+        if k == 2:
+            tracker.interrupt()
+        tracker.push(CloudFrame(k, float(k), points), se3.translation([x, 0, 0]))
+    np.testing.assert_allclose(method.guesses, [0.1, 0.0, 0.1], atol=1e-9)
+
+
 @dataclass(frozen=True)
 class Doubtful(AnyPair):
     """Searches find a pose that is probable, or none; alignments find the one near their guess."""

@@ -5,11 +5,14 @@ import itertools
 import numpy as np
 import pytest
 
+from tofuse.engine.alignment.projective import UNITS
+from tofuse.engine.alignment.uncertainty import with_prior
 from tofuse.engine.geometry import se3
 from tofuse.engine.tracking.motion_prediction import (
     Prediction,
     degenerate_runs,
     steps_between_bounded,
+    with_prediction,
 )
 
 NONE, SOME = np.zeros((0, 6)), np.eye(6)[:1]
@@ -83,12 +86,33 @@ def test_degenerate_directions_are_excluded() -> None:
     assert found.sigma[0] == pytest.approx(ignored.sigma[0] * np.sqrt(3 / 2), rel=1e-3)
 
 
+def test_without_constrained_motion_error_is_half_of_the_rms_motion() -> None:
+    """Along each axis, though the camera moves along one of them, and not all the time."""
+    motions = np.zeros((40, 6))
+    motions[::4, 0], motions[:, 4] = 0.06, 0.02
+    found = Prediction.of(path(motions), [np.eye(6)] * 41)
+    assert found.sigma[0] == pytest.approx(0.5 * 0.06 / np.sqrt(4 * 3), rel=1e-3)
+    assert found.sigma[1] == pytest.approx(0.5 * 0.02 / np.sqrt(3), rel=1e-3)
+
+
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 5])
 def test_few_poses_give_default_growth(n) -> None:
     found = Prediction.of(path(np.full((n, 6), 0.1))[:n], [NONE] * n)
     assert np.isfinite(found.sigma).all()
     assert min(found.sigma) > 0
     assert found.power == (2.0, 2.0)
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.3, 3.0])
+def test_prediction_replaces_the_prior_of_the_alignment(sigma) -> None:
+    """Otherwise no motion along a wall would be less certain than that prior, however long."""
+    rng = np.random.default_rng(8)
+    root = rng.standard_normal((6, 6)) * UNITS[:, None]
+    directions = np.linalg.qr(rng.standard_normal((6, 2)))[0].T
+    C = with_prior(root @ root.T, directions, np.full(6, 0.3))
+    found = np.linalg.inv(with_prediction(np.linalg.inv(C), directions * UNITS, (sigma, sigma)))
+    expected = with_prior(C, directions, np.full(6, sigma))
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
 
 
 def along(speeds):

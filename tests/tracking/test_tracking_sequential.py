@@ -74,6 +74,18 @@ def test_odometry_guess_is_relative_pose():
         np.testing.assert_array_equal(guesses[missing], np.eye(4))
 
 
+@pytest.mark.parametrize("guess", ["previous", "odometry"])
+def test_another_recording_begins_without_a_guess(guess):
+    registrar = Scripted(list(MOTIONS))
+    tracker = Sequential(registrar, guess).start(0)
+    tracker.interrupt()
+    for k, T in enumerate(MOTIONS[:3]):
+        if k == 2:
+            tracker.interrupt()
+        tracker.push(cloud(k), T)
+    np.testing.assert_array_equal(registrar.asked[-1][2], np.eye(4))
+
+
 def test_lost_frame_has_reason_and_next_uses_last_tracked():
     registrar = Scripted(
         [MOTIONS[0], RegistrationError("no overlap"), found(MOTIONS[1], 0.019), MOTIONS[2]]

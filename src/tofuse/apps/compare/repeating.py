@@ -8,6 +8,7 @@ of one session.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -49,7 +50,7 @@ class Session:
     Attributes
     ----------
     name, session
-        Its name, and the name of its session.
+        Its name, and that of its session: its folder, or the path of it if others have that name.
     result
         The result; None where only a surface is known.
     surface
@@ -166,10 +167,13 @@ def loaded_sessions(paths: Sequence[Path], progress: Progress) -> list[Session]:
     for path in paths:
         folders.check_result(path)
     reopening.check_different(paths)
-    for path in paths:
+    parents = [path.resolve().parent for path in paths]
+    names = Counter(folder.name for folder in set(parents))
+    for path, parent in zip(paths, parents, strict=True):
         result = load_result(path)
         surface = surface_of(result, str(path))
-        sessions.append(Session(str(path), path.resolve().parent.name, result, surface))
+        session = parent.name if names[parent.name] == 1 else str(parent)
+        sessions.append(Session(str(path), session, result, surface))
         progress.advance()
     return sessions
 

@@ -210,6 +210,14 @@ def span(directions: Float64, min_ratio: float) -> Float64:
     return np.asarray(u[:, s > min_ratio * s[0]], np.float64)
 
 
+def with_free_directions(information: Float64, basis: Float64) -> Float64:
+    """Return information (6, 6) without any along the directions of a basis (6, m)."""
+    along = information @ basis
+    return np.asarray(
+        information - along @ np.linalg.pinv(basis.T @ along, hermitian=True) @ along.T, np.float64
+    )
+
+
 def registration_of(aligned: Aligned, T_target_source: Float64, C: Float64) -> Registration:
     """Return an alignment with one target as a registration.
 

@@ -460,14 +460,20 @@ class _Comparison:
         return se3.log(se3.inverse(self.tracked) @ self.odometry)
 
     def lengths_agree(self, scales: Float64) -> bool:
-        """Whether tracked lengths differ from those of the odometry by less than half (95 %)."""
+        """Whether tracked lengths differ from those of the odometry by less than half (95 %).
+
+        Motions over more frames are sums of those over fewer, so that the number of frames is taken
+        over which they tell most; about as many of them are independent as don't overlap.
+        """
         t, o = self.tracked[:, :3, 3], self.odometry[:, :3, 3]
-        weight = 3 / np.trace(self._covariances(scales)[:, :3, :3], axis1=1, axis2=2)
-        information = float((weight * (o * o).sum(1)).sum())
-        if information == 0:
+        sigmas2 = np.trace(self._covariances(scales)[:, :3, :3], axis1=1, axis2=2) / 3
+        weight = 1 / (sigmas2 * self.spans)
+        information = np.bincount(self.spans, weight * (o * o).sum(1))
+        span = int(information.argmax())
+        if information[span] == 0:
             return False
-        ratio = float((weight * (t * o).sum(1)).sum()) / information
-        return bool(abs(ratio - 1) + 2 / np.sqrt(information) < 0.5)
+        ratio = np.bincount(self.spans, weight * (t * o).sum(1))[span] / information[span]
+        return bool(abs(ratio - 1) + 2 / np.sqrt(information[span]) < 0.5)
 
 
 def _compare(

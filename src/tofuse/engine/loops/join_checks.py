@@ -226,5 +226,5 @@ def link_of(first: View, second: View, registration: Registration | None) -> Lin
 
 def _tracking_failures(components: Sequence[TrackedComponent]) -> int:
     """Number of components that end where the next frame of the recording begins another one."""
-    first = {(s.recording, int(s.frames[0])) for s in components}
-    return sum((s.recording, int(s.frames[-1]) + 1) in first for s in components)
+    first = {(int(s.recordings[0]), int(s.frames[0])) for s in components}
+    return sum((int(s.recordings[-1]), int(s.frames[-1]) + 1) in first for s in components)

@@ -304,7 +304,7 @@ class _Joiner:
         for before, after in itertools.pairwise(ordered):
             a = self._merged.of_component(before.component)
             b = self._merged.of_component(after.component)
-            if a is b or before.recording != after.recording:
+            if a is b or before.recordings[-1] != after.recordings[0]:
                 continue
             bridges: list[tuple[Link | None, JoinKind]] = [
                 (odometry_over(before, after), "odometry"),

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from tofuse.engine.alignment import Link, Registration
-from tofuse.engine.arrays import Float64, Intp
+from tofuse.engine.arrays import Bool, Float64, Intp
 from tofuse.engine.connections import parts_of
 from tofuse.engine.geometry import retract, se3, twist_between
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
@@ -60,7 +60,8 @@ class TrackedComponent:
     views
         The stored views of its frames.
     recording
-        Number of its recording, if several are merged: no motion is known between these.
+        Number of its recording, or (N,) of that of each frame, if several are merged: no motion is
+        known between these.
     odometry
         (N, 4, 4) T_odometry_camera by external odometry, NaN where there is none; None without any.
     """
@@ -70,13 +71,48 @@ class TrackedComponent:
     times: Float64
     poses: Float64
     views: tuple[View, ...]
-    recording: int = 0
+    recording: int | Intp = 0
     odometry: Float64 | None = None
 
     @cached_property
     def depth(self) -> float:
         """Median depth of its views, m."""
         return float(np.median([v.depth for v in self.views])) if self.views else 1.0
+
+    @cached_property
+    def recordings(self) -> Intp:
+        """(N,) number of the recording of each frame."""
+        return np.broadcast_to(np.asarray(self.recording, np.intp), self.frames.shape)
+
+    def part(self, chosen: Bool) -> TrackedComponent:
+        """Return the component without some of its frames (N,), but with all of its views."""
+        odometry = None if self.odometry is None else self.odometry[chosen]
+        return replace(
+            self,
+            frames=self.frames[chosen],
+            times=self.times[chosen],
+            poses=self.poses[chosen],
+            recording=self.recordings[chosen],
+            odometry=odometry,
+        )
+
+
+def successions(
+    a: TrackedComponent, b: TrackedComponent
+) -> Iterator[tuple[TrackedComponent, TrackedComponent]]:
+    """Yield the frames of the earlier component up to where the other one follows, and those after.
+
+    Several times if one was joined across the other before; but not between two recordings.
+    """
+    frames = np.concatenate([a.frames, b.frames])
+    order = np.argsort(frames)
+    is_b = order >= len(a.frames)
+    recordings = np.concatenate([a.recordings, b.recordings])[order]
+    follows = (is_b[1:] != is_b[:-1]) & (recordings[1:] == recordings[:-1])
+    for k in np.flatnonzero(follows).tolist():
+        before, after = (b, a) if is_b[k] else (a, b)
+        last = frames[order[k]]
+        yield before.part(before.frames <= last), after.part(after.frames > last)
 
 
 def motion_over(
@@ -97,7 +133,8 @@ def end_speeds(component: TrackedComponent, *, end: bool) -> Float64:
     if len(poses) < 2:
         return np.zeros((0, 2))
     elapsed = np.maximum(np.diff(times), 1e-9)
-    return se3.lengths(se3.inverse(poses[:-1]) @ poses[1:]) / elapsed[:, None]
+    speeds = se3.lengths(se3.inverse(poses[:-1]) @ poses[1:]) / elapsed[:, None]
+    return speeds[np.diff(component.recordings[window]) == 0]
 
 
 def largest_motion(before: TrackedComponent, after: TrackedComponent) -> Float64:
@@ -354,11 +391,9 @@ class MergedComponents:
     def of_same_recording(
         self, a: MergedComponent, b: MergedComponent
     ) -> Iterator[tuple[TrackedComponent, TrackedComponent]]:
-        """Yield pairs of tracked components of one recording, the earlier one first."""
+        """Yield where tracked components of one recording follow each other, see `successions`."""
         for c, d in itertools.product(a.T, b.T):
-            first, second = self.tracked[c], self.tracked[d]
-            if first.recording == second.recording:
-                yield (first, second) if first.frames[0] < second.frames[0] else (second, first)
+            yield from successions(self.tracked[c], self.tracked[d])
 
     def positions(self, a: MergedComponent, b: MergedComponent) -> tuple[int, int]:
         """Return the positions of two merged components, ascending."""

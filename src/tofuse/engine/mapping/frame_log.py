@@ -89,6 +89,11 @@ class FrameSequence:
         self._index = index
         self.kind = self.kind or kind
 
+    def interrupt(self) -> None:
+        """Begin another recording, whose clock and images are others than those before."""
+        self._previous = None
+        self._times = None if self._times is None else []
+
     def is_repeated(self, frame: Frame) -> bool:
         """Whether an image equals the previous one: the camera is stuck, as noise never repeats."""
         if not isinstance(frame, RangeFrame):
@@ -265,7 +270,7 @@ class FrameLog:
                     np.array([e.record.timestamp for e in entries]),
                     np.array(poses),
                     tuple(v for v in views.views if v.component == component),
-                    entries[0].recording,
+                    np.array([e.recording for e in entries], np.intp),
                     _odometry(entries),
                 )
             )

@@ -80,10 +80,11 @@ class LivePoses:
         self._pending = False  # whether there are closed loops that were not yet optimised
         self._n_new = 0  # frames of this component since the last optimisation
         self._n_frames = 0  # frames of this component
-        # Poses of the components that are connected to the first one, and the correction of the
-        # current one by loops.
+        # Poses of the components that are connected to the first one; the correction of new frames
+        # by loops, and those of frames that were corrected, by index.
         self._T_world_component: dict[int, Float64] = {0: np.eye(4)}
         self._T_closed_tracked = np.eye(4)
+        self._corrections: dict[int, Float64] = {}
         # Of frames that were asked for, by index; None where a direction is not measured.
         self._covariances: dict[int, Float64 | None] = {}
 
@@ -96,17 +97,19 @@ class LivePoses:
         poses = poses_in_world(component_log, {step.component: np.eye(4)})
         tracked = TrackedGraph(component_log.posed, poses, ()).build(loops)
         optimised = self._optimiser.optimise(tracked).graph
-        self._T_closed_tracked = optimised.poses[-1] @ se3.inverse(tracked.poses[-1])
+        corrections = optimised.poses @ se3.inverse(tracked.poses)
+        self._T_closed_tracked = corrections[-1]
+        self._corrections.update(zip(optimised.ids.tolist(), corrections, strict=True))
 
     def due_loops(self, step: Step, log: FrameLog) -> list[ClosedLoop]:
         """Add the next frame; return the loops of its component if optimisation is due, else []."""
+        for link in step.links:
+            self._connect(link, log)
+        if step.T_component_camera is None:  # a lost frame is in no component
+            return []
         if step.component != self._component:
             self._component, self._T_closed_tracked = step.component, np.eye(4)
             self._pending, self._n_new, self._n_frames = False, 0, 0
-        for link in step.links:
-            self._connect(link, log)
-        if step.T_component_camera is None:
-            return []
         self._n_frames, self._n_new = self._n_frames + 1, self._n_new + 1
         self._pending |= self._loops.advance()
         if not self._pending or self._n_new < _MIN_NEW_FRACTION * self._n_frames:
@@ -169,7 +172,8 @@ class LivePoses:
         assert a.T_component_camera is not None
         assert b.T_component_camera is not None
         T_a_b = a.T_component_camera @ link.T_i_j @ se3.inverse(b.T_component_camera)
-        T_world[b.component] = T_world[a.component] @ T_a_b
+        newest = self._T_closed_tracked if a.component == self._component else np.eye(4)
+        T_world[b.component] = T_world[a.component] @ self._corrections.get(link.i, newest) @ T_a_b
 
     def finish(self) -> None:
         """Wait for the running search, and end the thread."""

@@ -211,10 +211,12 @@ class Mapper:
         if repeated and step.status == "tracked":
             reason = f"the same image as frame {self._log.entries[-1].record.index}"
             step = replace(step, status="predicted", reason=reason)
+        if step.T_component_camera is None:  # a lost frame is in no component
+            return step
         if step.component != self._component:
             self._component = step.component
             self._preparation.begin_component()
-        if step.status == "tracked" and step.T_component_camera is not None:
+        if step.status == "tracked":
             self._preparation.add_pose(filtered.for_tracking, step.T_component_camera)
         return step
 
@@ -280,7 +282,8 @@ class Mapper:
         self._check_open()
         if self._log.entries:
             self._log.interruptions.append(len(self._log.entries))
-        self._tracker.interrupt()
+        for part in (self._tracker, self._preparation, self._sequence):
+            part.interrupt()
         if config is not None:
             self._preparation = Preparation(config, self._preparation.counts)
             self._tracker = config.odometry.start(self.seed, config.search)

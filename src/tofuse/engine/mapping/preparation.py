@@ -155,6 +155,10 @@ class Preparation:
         self.counts.add(filtered.removals)
         return filtered
 
+    def interrupt(self) -> None:
+        """Begin another recording: its first frames have no neighbours in time before them."""
+        self._history.clear()
+
     def add_pose(self, frame: Frame, T_component_camera: Float64) -> None:
         """Pass the pose (4, 4) of a frame in the current component to the corrections."""
         for corrector in self._correctors:

@@ -427,7 +427,7 @@ def without_degenerate(
             continue
         basis = projective.span(degenerate, _DISTINCT)
         H = information[k] * np.outer(projective.UNITS, projective.UNITS)
-        scaled = H - H @ basis @ np.linalg.pinv(basis.T @ H @ basis, hermitian=True) @ basis.T @ H
+        scaled = projective.with_free_directions(H, basis)
         unbounded = basis @ np.linalg.inv(basis.T @ unmeasured_variance @ basis) @ basis.T
         measured = scaled + unbounded
         leak_variance = _LEAK**2 * max(n_degenerate[a], n_degenerate[b])

@@ -19,6 +19,7 @@ from tofuse.engine.compute import tukey_kernels as tukey
 from tofuse.engine.icp import icp_kernels
 
 _MIN_PIVOT = 1e-9
+_MIN_POINTS = 4  # of a cell with a plane
 # Residuals beyond this many standard deviations have no weight (Tukey's biweight; with 4.685 it has
 # 95 % of the efficiency of least squares for normal errors).
 ROBUST = 4.685
@@ -59,10 +60,10 @@ def fit_cells(
                 mean[s, c] += x[k, c]
             if k == a or view[k] != view[k - 1]:
                 view_counts[s] += 1
-        if b - a < 4:
-            continue
         for c in range(3):
-            mean[s, c] /= b - a
+            mean[s, c] /= max(b - a, 1)
+        if b - a < _MIN_POINTS:
+            continue
         C[:, :] = 0.0
         for k in range(a, b):
             for c in range(3):
@@ -224,7 +225,7 @@ def plane_support(
         (N,), added to: 1 for a point on a plane.
     """
     for s in range(len(start) - 1):
-        if view_counts[s] < 2:
+        if view_counts[s] < 2 or start[s + 1] - start[s] < _MIN_POINTS:
             continue
         for k in range(start[s], start[s + 1]):
             r = 0.0

@@ -410,10 +410,12 @@ def _priors(ids: Sequence[int], measured: external_sensors.SensorPriors) -> Prio
 def with_unsupported_views_fixed(before: Float64, after: Float64, lost: Bool) -> Float64:
     """Return the refined poses, with views that lost support fixed to their nearest neighbour.
 
+    The first one stays.
+
     Parameters
     ----------
     before, after
-        (N, 4, 4) poses before and after the refinement.
+        (N, 4, 4) poses before and after the refinement, in which the first one stays.
     lost
         (N,) mask of the views that lost support.
     """
@@ -422,7 +424,7 @@ def with_unsupported_views_fixed(before: Float64, after: Float64, lost: Bool) ->
     for k in np.flatnonzero(lost) if len(supported) else ():
         nearest = supported[np.argmin(np.abs(supported - k))]
         out[k] = out[nearest] @ se3.inverse(before[nearest]) @ before[k]
-    return se3.inverse(out[0]) @ out if lost[0] else out
+    return before[0] @ se3.inverse(out[0]) @ out if lost[0] else out
 
 
 def without_errors(points: Float32, errors: Mapping[str, float]) -> Float32:

@@ -58,7 +58,7 @@ class Prediction:
     def of(cls, poses: Float64, unobservable: Sequence[Float64]) -> Prediction:
         """Estimate it from the constrained motions of a recording.
 
-        If too few directions were constrained, sigma is half of the typical motion.
+        If too few directions were constrained, sigma is half of the rms motion.
 
         Parameters
         ----------
@@ -70,7 +70,8 @@ class Prediction:
         if len(poses) < 3:
             return cls((0.1, 0.1))
         motions = se3.inverse(poses[:-1]) @ poses[1:]
-        typical = np.sqrt((se3.log(motions) / projective.UNITS).reshape(-1, 2, 3) ** 2).mean((0, 2))
+        squares = (se3.log(motions) / projective.UNITS).reshape(-1, 2, 3) ** 2
+        typical = np.sqrt(squares.mean((0, 2)))
         rms, enough = _errors(poses, motions, unobservable, 1)
         sigma = np.maximum(np.where(enough, rms, _MOTION_FRACTION * typical), _MIN_SIGMA)
         power = (_DEFAULT_POWER, _DEFAULT_POWER)
@@ -235,7 +236,9 @@ def _of_speed(even: Float64, speed: float, turn: float) -> Float64:
 def with_prediction(
     information: Float64, unobservable: Float64, sigma: tuple[float, float]
 ) -> Float64:
-    """Add the information of the prediction in degenerate directions to that of a registration.
+    """Return the information of a registration, with that of the prediction along degenerate axes.
+
+    There it replaces the prior of the alignment, which is that of any prediction.
 
     Parameters
     ----------
@@ -250,7 +253,7 @@ def with_prediction(
         return information
     basis, _ = np.linalg.qr((unobservable / projective.UNITS).T)
     variance = (np.repeat(sigma, 3) / projective.UNITS) ** 2
-    prior_information = basis @ np.linalg.inv(basis.T @ (variance[:, None] * basis)) @ basis.T
-    return np.asarray(
-        information + prior_information / np.outer(projective.UNITS, projective.UNITS), np.float64
-    )
+    units = np.outer(projective.UNITS, projective.UNITS)
+    predicted = basis @ np.linalg.inv(basis.T @ (variance[:, None] * basis)) @ basis.T
+    measured = projective.with_free_directions(information * units, basis)
+    return np.asarray((measured + predicted) / units, np.float64)

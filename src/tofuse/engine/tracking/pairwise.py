@@ -99,8 +99,9 @@ class _SequentialTracker(Tracker):
         self._motion = np.eye(4)
 
     def interrupt(self) -> None:
-        """See `Tracker.interrupt`."""
+        """See `Tracker.interrupt`. Its odometry is in another frame."""
         self._motion = np.eye(4)
+        self._last = None if self._last is None else replace(self._last, T_odometry=None)
 
     def push(
         self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
@@ -223,9 +224,11 @@ class _PairwiseTracker(Tracker):
         self._motion_confirmed: deque[bool] = deque(maxlen=_MIN_CONFIRMED + 1)
 
     def interrupt(self) -> None:
-        """See `Tracker.interrupt`."""
+        """See `Tracker.interrupt`. Its odometry is in another frame."""
         self._motion.interrupt()
         self._motion_confirmed.clear()
+        for k, posed in enumerate(self._posed):
+            self._posed[k] = replace(posed, T_odometry=None)
 
     def push(
         self, frame: Frame, T_odometry: Float64 | None = None, surface: PreparedView | None = None
