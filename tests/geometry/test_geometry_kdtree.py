@@ -41,3 +41,16 @@ def test_non_finite_query_has_no_neighbour():
 def test_bad_points_are_rejected(bad):
     with pytest.raises(InputError):
         KdTree(bad)
+
+
+def test_all_points_within_a_distance_are_found():
+    rng = np.random.default_rng(3)
+    points, queries = rng.normal(size=(300, 3)), rng.normal(size=(40, 3))
+    queries[7] = 50.0  # has none
+    first, index, distance = KdTree(points).within(queries, 0.8)
+    apart = np.linalg.norm(queries[:, None] - points, axis=2)
+    assert len(first) == 41
+    for k in range(40):
+        found = index[first[k] : first[k + 1]]
+        assert sorted(found) == np.flatnonzero(apart[k] <= 0.8).tolist()
+        np.testing.assert_allclose(distance[first[k] : first[k + 1]], apart[k, found])

@@ -603,22 +603,24 @@ def _refinement_stages(size: float) -> tuple[Icp, ...]:
     )
 
 
-def _rival(views: _CloudViews, poses: Sequence[_Pose], best: _Pose, T: Float64) -> _Pose:
-    """Return the first pose distinct from the best one, whose alignment is T (4, 4).
+def _rival(views: _CloudViews, poses: Sequence[_Pose], best: _Pose, aligned: _Pose) -> _Pose:
+    """Return the first pose distinct from the best one, which was `aligned` with all points.
 
     With large noise, subsets of the points may converge to different poses, but all points to the
-    same one; so rivals are aligned with more points before they are compared.
+    same one; so rivals that score nearly as high are aligned with more points before.
     """
     averaged = views.source_map.view, views.target_map.view
     for pose in poses:
         start = pose.T_target_source
         if not views.are_distinct_poses(start, best.T_target_source):
             continue
+        if aligned.agreement.score - pose.agreement.score >= pose_probability.MIN_LEAD:
+            return pose
         try:
             converged = CoarseToFine().approximate_pose(views.size, *averaged, start, _RIVAL_POINTS)
         except RegistrationError:
             converged = start
-        if views.are_distinct_poses(converged, T):
+        if views.are_distinct_poses(converged, aligned.T_target_source):
             return pose
     return _NO_RIVAL
 
@@ -640,7 +642,7 @@ def _registration(
         registration = replace(registration, T_target_source=T)
         pose = best
     agreement = pose.agreement
-    rival = None if poses is None else _rival(views, poses, best, pose.T_target_source)
+    rival = None if poses is None else _rival(views, poses, best, pose)
     lead = None if rival is None else agreement.score - max(rival.agreement.score, 0.0)
     if lead is not None and len(registration.unobservable):
         lead = min(lead, 0.0)  # poses along these directions fit as well

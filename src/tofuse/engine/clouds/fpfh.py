@@ -32,8 +32,6 @@ POINTS, REACH, FPFH_NEIGHBOURS = 4000, 5.0, 12
 _BINS = 11
 # Resolution of the averaged views in spacings of the points: averages are less noisy than samples.
 _COARSER = 2.0
-# Maximum number of neighbours within reach.
-_MAX_NEIGHBOURS = 85
 # Resolution of the surroundings, in resolutions of the points, and their radius in its resolutions.
 _SURROUNDINGS, _SURROUNDINGS_REACH = 2.0, 6.0
 # Each point is matched with this many, if it is among as many nearest of theirs.
@@ -281,26 +279,26 @@ def fpfh(
     surroundings
         Points and normals (m, 3) that are the neighbours; the points themselves unless given.
     """
-    n, first = len(points), 0
+    n = len(points)
     tree = KdTree(points if surroundings is None else surroundings[0])
     if surroundings is not None:
         points, normals = (
             np.vstack(both) for both in zip((points, normals), surroundings, strict=True)
         )
-        first = n
-    neighbours, squared = tree.neighbours(points, min(_MAX_NEIGHBOURS + 1, len(tree)))
-    neighbours += first
+    first, neighbours, distances = tree.within(points, reach)
+    if surroundings is not None:
+        neighbours += n
     spfh, neighbour_mean = np.empty((len(points), 3, _BINS)), np.empty((n, 3 * _BINS))
     run_chunks(
         lambda a, b: kernels.histograms(
-            points, normals, neighbours, squared, reach, signed, spfh, a, b
+            points, normals, first, neighbours, distances, signed, spfh, a, b
         ),
         len(points),
     )
     spfh_flat = spfh.reshape(-1, 3 * _BINS)
     run_chunks(
         lambda a, b: kernels.weighted_means(
-            spfh_flat, neighbours, squared, reach, neighbour_mean, a, b
+            spfh_flat, first, neighbours, distances, neighbour_mean, a, b
         ),
         n,
     )
@@ -324,8 +322,10 @@ def most_similar(a: Float64, b: Float64, count: int) -> Int64:
 
 def _squared_distances(a: Float64, b: Float64) -> Float32:
     rows, columns = (np.asarray(x, np.float32) for x in (a, b))
-    squared = (rows**2).sum(1)[:, None] + (columns**2).sum(1) - 2 * (rows @ columns.T)
-    return np.asarray(squared, np.float32)
+    squared = np.asarray(rows @ (-2 * columns.T), np.float32)
+    squared += (rows**2).sum(1)[:, None]
+    squared += (columns**2).sum(1)
+    return squared
 
 
 def _smallest(distance: Float32, count: int) -> Int64:
@@ -350,7 +350,7 @@ def fitting(
     normals = view.normals @ T[:, :3, :3].transpose(0, 2, 1)
     nearest, squared = other.tree.nearest(points.reshape(-1, 3), reach_m)
     nearest, squared = nearest.reshape(points.shape[:2]), squared.reshape(points.shape[:2])
-    cosine = (normals * other.normals[nearest]).sum(2)
+    cosine = np.einsum("kni,kni->kn", normals, other.normals[nearest])
     same_normal = (cosine if other.sphere is not None else np.abs(cosine)) > _MIN_NORMAL_COSINE
     return points, nearest, np.where(same_normal, np.maximum(1 - squared / reach_m**2, 0), 0)
 

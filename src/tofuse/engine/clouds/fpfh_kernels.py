@@ -12,9 +12,9 @@ from tofuse.engine.compute import kernel
 def histograms(
     points: Float64,
     normals: Float64,
+    first: Int64,
     neighbours: Int64,
-    distance2: Float64,
-    radius: float,
+    distances: Float64,
     signed: bool,
     out: Float64,
     start: int,
@@ -26,10 +26,8 @@ def histograms(
     ----------
     points, normals
         (n, 3).
-    neighbours, distance2
-        (n, k) neighbours of each point and their squared distances.
-    radius
-        Neighbours that are further away than this are ignored, m.
+    first, neighbours, distances
+        See `KdTree.within`. Neighbours at the same place are ignored.
     signed
         See `fpfh`.
     """
@@ -37,12 +35,13 @@ def histograms(
     for i in range(start, stop):
         count = 0
         out[i] = 0
-        for a in range(neighbours.shape[1]):
-            j = neighbours[i, a]
-            length = np.sqrt(distance2[i, a])
-            if j == i or length == 0 or length > radius:
+        for a in range(first[i], first[i + 1]):
+            j, length = neighbours[a], distances[a]
+            if length == 0:
                 continue
-            dx, dy, dz = (points[j] - points[i]) / length
+            dx = (points[j, 0] - points[i, 0]) / length
+            dy = (points[j, 1] - points[i, 1]) / length
+            dz = (points[j, 2] - points[i, 2]) / length
             ux, uy, uz = normals[i]
             nx, ny, nz = normals[j]
             vx, vy, vz = uy * dz - uz * dy, uz * dx - ux * dz, ux * dy - uy * dx
@@ -69,9 +68,9 @@ def histograms(
 @kernel
 def weighted_means(
     values: Float64,
+    first: Int64,
     neighbours: Int64,
-    distance2: Float64,
-    radius: float,
+    distances: Float64,
     out: Float64,
     start: int,
     stop: int,
@@ -80,12 +79,12 @@ def weighted_means(
     for i in range(start, stop):
         total = 0.0
         out[i] = 0
-        for a in range(neighbours.shape[1]):
-            j = neighbours[i, a]
-            length = np.sqrt(distance2[i, a])
-            if j == i or length == 0 or length > radius:
+        for a in range(first[i], first[i + 1]):
+            j, length = neighbours[a], distances[a]
+            if length == 0:
                 continue
             total += 1 / length
-            out[i] += values[j] / length
+            for k in range(values.shape[1]):
+                out[i, k] += values[j, k] / length
         if total > 0:
             out[i] /= total

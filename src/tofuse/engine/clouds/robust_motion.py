@@ -209,7 +209,7 @@ def _motions_from(H: Float64, p0: Float64, q0: Float64) -> Float64:
 def squared_residuals(pairs: Pairs, motions: Float64) -> Float64:
     """Return the normalised squared residuals (k, m) of motions (k, 4, 4)."""
     residual = se3.transform(motions, pairs.source) - pairs.target
-    return np.asarray((residual**2).sum(2) / pairs.variance, np.float64)
+    return np.einsum("kmi,kmi->km", residual, residual) / pairs.variance
 
 
 def distinct(

@@ -59,6 +59,21 @@ class KdTree:
             raise ValueError("k must be at least 1")
         return self._search(queries, k, max_distance)
 
+    def within(self, queries: ArrayLike, max_distance: float) -> tuple[Int64, Int64, Float64]:
+        """Find all points not further than `max_distance` m from each of M finite queries (M, 3).
+
+        Those of query k, in any order, have the positions first[k] to first[k + 1]. Returns first
+        (M + 1,), and the index and the distance in m of all that were found.
+        """
+        array = checked_points(queries, "queries")
+        found = cKDTree(array).sparse_distance_matrix(
+            self._tree, max_distance, output_type="ndarray"
+        )
+        found = found[np.argsort(found["i"], kind="stable")]
+        counts = np.bincount(found["i"], minlength=len(array))
+        first = np.concatenate([[0], np.cumsum(counts)])
+        return first, found["j"].astype(np.int64), found["v"].copy()
+
     def _search(self, queries: ArrayLike, k: int, max_distance: float) -> tuple[Int64, Float64]:
         """Indices and squared distances (M, k); a query that is not finite has no neighbours."""
         array = checked_points(queries, "queries")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -35,6 +36,8 @@ _MAX_ROUGHNESS, _ROUGHNESS_SAMPLE = 0.25, 1500
 _COARSENING = 1.5
 # Minimum extent of the scene, in resolutions of the finest level.
 _MIN_EXTENT = 10
+# Cache: a view is registered to several others.
+_spacings: WeakKeyDictionary[Frame, float] = WeakKeyDictionary()
 
 
 @part("registration", "coarse-to-fine", label="validated")
@@ -205,6 +208,12 @@ def _remapped(
 
 def spacing(view: Frame) -> float:
     """Median distance in m between neighbours among 5000 evenly chosen points; 0.01 if too few."""
+    if view not in _spacings:
+        _spacings[view] = _spacing(view)
+    return _spacings[view]
+
+
+def _spacing(view: Frame) -> float:
     points = view.points[:: max(1, len(view) // _SPACING_SAMPLE)].astype(np.float64)
     if len(points) < 2:
         return 0.01
