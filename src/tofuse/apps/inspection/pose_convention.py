@@ -19,6 +19,7 @@ from tofuse.formats.poses import OPENGL
 # remaining one, as a fraction: with another wrong convention, some motions fit too. All within this
 # factor of the best one are named, as about one axis some are the same.
 _MIN_LEAD, _MIN_LEAD_SIGMAS, _MAX_REMAINING, _EQUAL = np.radians(1.5), 4.0, 0.35, 1.5
+_ROUNDING = 1e-4  # rad, of poses in text files with few digits
 # Shortest distance from which the scale is estimated, as a fraction of the depth, and cosine of its
 # directions; largest factor that is not reported: devices err by less; and within which of a unit's
 # that unit is named.
@@ -104,7 +105,9 @@ def difference(estimate: Float64, reference: Float64) -> str | None:
     if as_read.mean() > _MIN_LEAD + best and best <= _MAX_REMAINING * as_read.mean():
         ifs = []
         for name, sides in converted.items():
-            fit = [side for side, error in sides.items() if error.mean() <= _EQUAL * best]
+            fit = [
+                side for side, error in sides.items() if error.mean() <= _EQUAL * best + _ROUNDING
+            ]
             ifs += [f"{' or '.join(fit)} holds {name}"] if fit else []
         return (
             f"the poses differ by {np.degrees(as_read.mean()):.1f} degrees as they are read, and "
