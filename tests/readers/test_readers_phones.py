@@ -48,6 +48,15 @@ def test_scanner_app_derives_image_size_from_projection(tmp_path: Path) -> None:
     assert frame.camera.fx == pytest.approx(made.FX / 60)
 
 
+def test_scanner_app_without_metadata_says_what_is_missing(tmp_path: Path) -> None:
+    made.make_scanner_app(tmp_path / "scan")
+    for path in (tmp_path / "scan").glob("frame_*.json"):
+        path.unlink()
+    says = r"3 depth_\*\.png without frame_\*\.json; .*share 'All data' from 3d Scanner App again"
+    with pytest.raises(InputError, match=says):
+        open_recording(tmp_path / "scan")
+
+
 def test_scanner_app_refuses_turned_depth(tmp_path: Path) -> None:
     """The lens is of ARKit's landscape images: scaled to upright ones it would have two scales."""
     made.make_scanner_app(tmp_path / "scan")
