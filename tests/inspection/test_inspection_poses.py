@@ -33,11 +33,13 @@ def turned(T, quarters):
     return T @ se3.exp(np.array([0, 0, 0, 0, 0, quarters * np.pi / 2]))
 
 
+UNITY = np.diag([1.0, -1, 1, 1])
 MISREAD = {
     "T_camera_world, the inverse": se3.inverse,
     "are poses of a camera with the axes of OpenGL": lambda T: T @ GL,
     "T_camera_world of a camera with the axes of OpenGL": lambda T: se3.inverse(T @ GL),
     "the axes of a robot": lambda T: T @ BODY,
+    "the left-handed axes of Unity": lambda T: UNITY @ T @ UNITY,
     "order w, x, y, z": lambda T: rolled(T, 1),
     "order x, y, z, w": lambda T: rolled(T, -1),
     "turned by 90 degrees": lambda T: turned(T, -1),

@@ -36,6 +36,7 @@ _MIN_PAIRS, _VIEWS = 3, 8
 _TURN, _MIN_TURN, _MAX_TURN, _MAX_STRIDE = 0.1, 0.03, 0.25, 60
 # R_robot_camera: a robot has x forward, y left and z up.
 _ROBOT = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+_UNITY = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 def _times(T_given_camera: Float64) -> Callable[[Float64], Float64]:
@@ -63,6 +64,9 @@ _CONVENTIONS: dict[str, Callable[[Float64], Float64]] = {
         lambda poses: np.asarray(se3.inverse(poses) @ OPENGL)
     ),
     "poses of a body with the axes of a robot (x forward, z up)": _times(_ROBOT),
+    "poses with the left-handed axes of Unity (y up, z forward)": (
+        lambda poses: np.asarray(_UNITY @ poses @ _UNITY)
+    ),
     "poses with quaternions in the order w, x, y, z": _reordered(-1),
     "poses with quaternions in the order x, y, z, w": _reordered(1),
     **{
