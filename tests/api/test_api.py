@@ -314,6 +314,10 @@ def test_from_arrays_keeps_images_and_timestamps(arrays):
             "(95, 30) outside of images of 80 x 60",
         ),
         ({"depth": np.ones((60, 80, 24))}, "frames come first; pass numpy.moveaxis(depth, -1, 0)"),
+        (
+            {"depth": np.ones((24, 80, 60))},
+            "rows come before columns; pass numpy.swapaxes(depth, 1",
+        ),
         ({"depth": np.ones((60, 80, 90))}, "that of images of 80 x 60 pixels, and depth"),
         (
             {"depth": np.ones((60, 80, 6)), "camera": tofuse.Pinhole(80, 60, 70, 70, 39.5, 29.5)},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -125,6 +126,17 @@ def test_fit_is_robust_to_outliers() -> None:
         measured = view.measured_m + wild * rng.uniform(0, 0.3, count)
         views.append(replace(view, measured_m=measured))
     assert rms(curve_error(calibrate_depth(views, CAMERA))) < 0.0015
+
+
+@pytest.mark.parametrize("size", [1.0, 0.97])
+def test_wrong_size_of_the_board_is_suspected(size: float) -> None:
+    """Planes of a board whose squares are said to be larger are too far: ranges seem too short."""
+    views = [
+        replace(view, plane=view.plane * size) for view in made_views(known=True, constant=0.01)
+    ]
+    warnings = calibrate_depth(views, CAMERA).warnings
+    found = re.findall(r"ranges are (.*) % too short, .*: measure a square", "\n".join(warnings))
+    assert [float(percent) for percent in found] == pytest.approx([3] * (size != 1), abs=0.5)
 
 
 def test_single_distance_is_rejected() -> None:

@@ -113,6 +113,12 @@ def test_two_results_are_compared_by_their_sigmas(tmp_path: Path) -> None:
     assert any("twice their sigmas" in warning for warning in card.warnings)
 
 
+def test_two_results_show_no_drift_but_no_difference(tmp_path: Path) -> None:
+    pair = [session(tmp_path / f"{k}", 20_000 + k, seed=k) for k in range(2)]
+    sentence = make_card(pair).sentence
+    assert sentence == "No quantity differs between the results by more than its uncertainty."
+
+
 def test_what_a_run_corrected_belongs_to_the_camera(tmp_path: Path) -> None:
     corrected = {"part": "camera-errors", "focal": 0.05, "offset_m": 0.02, "focal_sigma": 0.001}
     multipath = {"part": "multipath", "strength": [0.3, 0.05]}

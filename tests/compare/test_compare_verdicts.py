@@ -14,6 +14,7 @@ from tofuse.apps.compare import deviations as module
 from tofuse.apps.compare.comparing import _regions, compared
 from tofuse.apps.compare.deviations import COVERAGE
 from tofuse.apps.compare.nearest import Reach, Reference
+from tofuse.apps.compare.page import compare_scene
 from tofuse.apps.compare.surface import Surface, in_metres, surface_of
 from tofuse.apps.pairs import register
 from tofuse.engine.errors import InputError
@@ -185,6 +186,17 @@ def test_cameras_of_a_result_are_known(room_result) -> None:
     result = tofuse.load(room_result)
     eyes = surface_of(result).eyes
     np.testing.assert_array_equal(eyes, result.trajectory[result.has_pose, :3, 3] + result.shift)
+
+
+def test_a_result_is_shown_upright(room_result) -> None:
+    """As in its report, however the first camera was held; the scene has y down."""
+    result = tofuse.load(room_result)
+    result = replace(result, up=se3.exp([0, 0, 0, 0, 0, 0.5])[:3, :3] @ [0, -1, 0])
+    comparison = tofuse.compare(result, result, guess=np.eye(4))
+    drawn_points = compare_scene(comparison)[0].points
+    upright = se3.transform(result.T_up_world, result.mesh.vertices) * [1, -1, -1]
+    for end in (np.min, np.max):
+        np.testing.assert_allclose(end(drawn_points, 0), end(upright, 0), atol=0.1)
 
 
 def test_a_solid_is_recognised(part) -> None:

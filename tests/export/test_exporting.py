@@ -211,6 +211,21 @@ def test_a_surface_without_triangles_is_refused(name: str, result: Path) -> None
         export(result, [name])
 
 
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [
+        ({"faces": 4}, "pcd"),
+        ({"every": 2}, "glb"),
+        ({"pinhole": True}, "stl"),
+        ({"voxel_m": 1}, "las"),
+    ],
+)
+def test_an_option_without_effect_is_refused(option: dict, name: str, result: Path) -> None:
+    with pytest.raises(InputError, match=rf"has no effect on {name}; leave it out; it is for"):
+        export(result, [name], **option)
+    assert not (result / FORMATS[name][0]).exists()
+
+
 def test_files_of_the_result_itself_are_not_replaced(result: Path, tmp_path: Path) -> None:
     export(result, ["glb"])
     change_run(result)  # seals the file as one that the run wrote

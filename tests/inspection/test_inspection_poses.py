@@ -33,11 +33,13 @@ def turned(T, quarters):
     return T @ se3.exp(np.array([0, 0, 0, 0, 0, quarters * np.pi / 2]))
 
 
+UNITY = np.diag([1.0, -1, 1, 1])
 MISREAD = {
     "T_camera_world, the inverse": se3.inverse,
     "are poses of a camera with the axes of OpenGL": lambda T: T @ GL,
     "T_camera_world of a camera with the axes of OpenGL": lambda T: se3.inverse(T @ GL),
     "the axes of a robot": lambda T: T @ BODY,
+    "the left-handed axes of Unity": lambda T: UNITY @ T @ UNITY,
     "order w, x, y, z": lambda T: rolled(T, 1),
     "order x, y, z, w": lambda T: rolled(T, -1),
     "turned by 90 degrees": lambda T: turned(T, -1),
@@ -140,6 +142,14 @@ def test_difference_from_a_reference_is_named(recording, words):
         words = f"the {larger} is {factor}"
     assert words.removeprefix("are ") in note
     assert difference(estimate, reference) is None
+
+
+def test_exact_inverse_may_be_either_trajectory():
+    """Both differ from the inverse of the other by rounding only, which 10 m amplify in one."""
+    poses = se3.exp(np.random.default_rng(1).normal(0, 0.5, (20, 6)))
+    poses[:, 0, 3] += 10
+    note = difference(se3.orthonormalise(np.round(se3.inverse(poses), 6)), poses)
+    assert "if the estimate or the reference holds T_camera_world" in note
 
 
 def test_a_slide_is_not_another_scale():

@@ -104,6 +104,17 @@ def test_poses_of_another_scale_are_judged_in_metres(factor, on_rail):
         np.testing.assert_array_equal(found.poses, on_rail.reference)
 
 
+def test_noise_of_positions_is_not_another_scale(on_rail):
+    """It makes steps longer in all directions, which a smaller scale would make fit better."""
+    noise = np.random.default_rng(1).normal(0, 0.1, (len(on_rail), 3))
+    poses = on_rail.reference.copy()
+    poses[:, :3, 3] += noise
+    found = tofuse.judge(on_rail, poses)
+    assert not found.scale.applied
+    assert "inconsistent_poses" in {reason.code for reason in found.reasons}
+    assert found.finding is None
+
+
 @pytest.mark.nightly_part
 def test_small_error_of_scale_is_an_error_unless_scale_is_unknown(on_rail):
     poses = with_scale(on_rail.reference, 1.08)

@@ -170,6 +170,18 @@ def test_order_kind_and_end_are_checked(frames) -> None:
             call()
 
 
+def test_mapper_of_another_process_is_refused(frames, monkeypatch):
+    """After a fork its threads are missing, and it would wait for them for ever."""
+    mapper = Mapper()
+    mapper.push(frames[0])
+    with monkeypatch.context() as forked:
+        forked.setattr("os.getpid", lambda: -1)
+        for call in (lambda: mapper.push(frames[1]), mapper.finish):
+            with pytest.raises(InputError, match="mapper: belongs to another process"):
+                call()
+    mapper.push(frames[1])
+
+
 @pytest.mark.parametrize(
     ("sensor", "problem"),
     [

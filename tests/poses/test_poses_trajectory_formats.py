@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, InputWarning
 from tofuse.engine.geometry import se3
 from tofuse.engine.geometry.quaternion import from_matrix
 from tofuse.engine.quality.trajectory_errors import evaluate_trajectory
@@ -104,7 +104,24 @@ def test_lost_frames_are_skipped(tmp_path: Path) -> None:
     np.testing.assert_allclose(found[3], POSES[3], atol=1e-9)
 
 
+def test_too_few_unnumbered_poses_are_assigned_with_a_warning(tmp_path: Path) -> None:
+    """Programs leave lost frames out of KITTI's files: then all later poses are of other frames."""
+    write_kitti(tmp_path / "kitti.txt", POSES[:4])
+    few = read_poses(tmp_path / "kitti.txt")
+    with pytest.warns(InputWarning, match=r"kitti.txt: has 4 poses .*, and the recording 5 frames"):
+        few.of_frames(TIMES, np.arange(5))
+    few.of_frames(TIMES[:2], np.array([1, 3]))  # frames 1 and 3 of a recording of four
+
+
 BAD = {
+    "pandas.csv": (
+        b"timestamp,tx,ty,tz,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n",
+        "line 1: .* begin it with",
+    ),
+    "euroc.csv": (
+        b"timestamp,x,y,z,w,x,y,z,vx,vy,vz\n1500000000000000000,0\n",
+        "begin it with '#'",
+    ),
     "empty.txt": (b"", "contains no poses"),
     "comments.txt": (b"# nothing\n", "contains no poses"),
     "two.txt": (b"1 2\n3 4\n", "has 2 columns"),

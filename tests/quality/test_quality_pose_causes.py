@@ -10,7 +10,7 @@ from tests.helpers.measured_graph import DEPTH_M, RIGID, jumped, measured
 
 from tofuse.apps.jobs.pose_scale import with_scale
 from tofuse.engine.geometry import se3
-from tofuse.engine.quality.pose_causes import cause_of
+from tofuse.engine.quality.pose_causes import _Hypothesis, _words, cause_of
 from tofuse.engine.quality.pose_deviation import deviation, fitted
 
 RATE_HZ = 10.0
@@ -74,6 +74,11 @@ def test_no_cause_of_correct_poses_nor_of_unrelated_errors(seed) -> None:
     for sigma in (0.0, 0.002, 0.02):
         poses = truth @ se3.exp(sigma * rng.standard_normal((len(truth), 6)))
         assert cause_of(deviation(fit, poses), velocity(poses)) is None
+
+
+def test_large_angles_have_no_exponent() -> None:
+    turning = _Hypothesis("turning", np.zeros((2, 6, 3)))
+    assert "by 220\N{DEGREE SIGN} in total" in _words(turning, np.array([0, 3.84, 0]), None)
 
 
 def test_unknown_times_exclude_an_offset() -> None:

@@ -163,9 +163,14 @@ def test_7scenes(tmp_path: Path) -> None:
     assert not frame.color_registered
     np.testing.assert_allclose(recording.timestamps, [0, 2 / 30, 4 / 30])
     np.testing.assert_allclose(recording.reference, POSES, atol=1e-12)
+    # 3DMatch's sequences without the file above them look the same.
+    assumed = "no camera-intrinsics.txt or info.txt: the camera of 7-Scenes is used (585 px)"
+    assert assumed in recording.warnings[0]
     (tmp_path / "seq-01" / "camera-intrinsics.txt").write_text("500 0 320\n0 510 240\n0 0 1\n")
     np.savetxt(tmp_path / "seq-01" / "frame-000002.pose.txt", np.full((4, 4), np.inf))
     recording = open_recording(tmp_path / "seq-01")
+    assert len(recording.warnings) == 1
+    assert assumed not in recording.warnings[0]
     assert np.isnan(recording.reference[1]).all()
     frame = recording[0]
     assert frame.camera == Pinhole(640, 480, 500.0, 510.0, 320.0, 240.0)

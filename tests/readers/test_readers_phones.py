@@ -19,6 +19,7 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.quality.map_agreement import map_consistency
 from tofuse.formats.geometry.ply import write_ply
+from tofuse.formats.images.images import write_png
 from tofuse.formats.recordings.open import open_recording
 
 
@@ -45,6 +46,37 @@ def test_scanner_app_derives_image_size_from_projection(tmp_path: Path) -> None:
     frame = open_recording(tmp_path / "scan")[0]
     assert isinstance(frame.camera, Pinhole)
     assert frame.camera.fx == pytest.approx(made.FX / 60)
+
+
+def test_scanner_app_without_metadata_says_what_is_missing(tmp_path: Path) -> None:
+    made.make_scanner_app(tmp_path / "scan")
+    for path in (tmp_path / "scan").glob("frame_*.json"):
+        path.unlink()
+    says = r"3 depth_\*\.png without frame_\*\.json; .*share 'All data' from 3d Scanner App again"
+    with pytest.raises(InputError, match=says):
+        open_recording(tmp_path / "scan")
+
+
+def test_scanner_app_refuses_turned_depth(tmp_path: Path) -> None:
+    """The lens is of ARKit's landscape images: scaled to upright ones it would have two scales."""
+    made.make_scanner_app(tmp_path / "scan")
+    for k in range(3):
+        write_png(tmp_path / "scan" / f"depth_{k:05d}.png", made.millimetres(made.DEPTH[k]).T)
+    with pytest.raises(InputError, match="1920 x 1440 image, depth 24 x 32: another aspect ratio"):
+        open_recording(tmp_path / "scan")[0]
+
+
+def test_scanner_app_without_some_metadata(tmp_path: Path) -> None:
+    """Times go on before the first known one, and after the last."""
+    made.make_scanner_app(tmp_path / "scan")
+    for k in (0, 1):
+        facts = json.loads((tmp_path / "scan" / "frame_00002.json").read_text())
+        facts["time"] = 10.0 + k
+        (tmp_path / "scan" / f"frame_{k + 2:05d}.json").write_text(json.dumps(facts))
+        (tmp_path / "scan" / f"frame_{k:05d}.json").unlink()
+    for k in (3, 4):
+        write_png(tmp_path / "scan" / f"depth_{k:05d}.png", made.millimetres(made.DEPTH[0]))
+    np.testing.assert_allclose(open_recording(tmp_path / "scan").timestamps, [8, 9, 10, 11, 12])
 
 
 def test_stray(tmp_path: Path) -> None:

@@ -194,6 +194,15 @@ def test_folder_of_images_needs_only_a_camera(tmp_path: Path) -> None:
     assert open_recording(bare, camera=lens).format == "pairs"
 
 
+def test_folder_of_depth_arrays_of_another_name_can_be_renamed(tmp_path: Path) -> None:
+    """As TartanAir's."""
+    (tmp_path / "P000" / "depth_left").mkdir(parents=True)
+    (tmp_path / "P000" / "image_left").mkdir()
+    np.save(tmp_path / "P000" / "depth_left" / "000000_left_depth.npy", np.ones((30, 40), "f4"))
+    with pytest.raises(InputError, match=r"name depth_left/ depth/, and add a camera\.json"):
+        open_recording(tmp_path / "P000")
+
+
 def test_colour_of_another_size_is_for_display_if_no_camera_is_known(tmp_path: Path) -> None:
     folder = write(tmp_path / "a", [1, 2])
     (folder / "camera.json").unlink()

@@ -40,6 +40,9 @@ _MEAN_M, _SLOPE = 0.002, 0.001
 _FIXED_M = 1e-7  # prior of curve and offsets that are fixed to 0
 _FLOOR_M = 0.001  # lower limit of the noise
 _MIN_SPREAD_M = 0.3
+# The scale of ranges is that of the clock of the light: larger errors, of a curve that passes 0 m
+# within this fraction of its values, are of the board.
+_MAX_SCALE_ERROR, _MAX_CONSTANT = 0.01, 1 / 3
 _MAX_SHAPE_M = 0.004  # standard deviation of the curve without mean and slope
 _BLUR_WIDTH = 1 / 50  # width of the blur, relative to the image's width
 
@@ -157,7 +160,10 @@ def calibrate_depth(views: Sequence[PlaneView], camera: Camera, where: str = "")
         _patch_rms(views, after, shape),
         constant,
         scale,
-        tuple(_warnings(views, len(observed) / (shape[0] * shape[1]))),
+        (
+            *_warnings(views, len(observed) / (shape[0] * shape[1])),
+            *_of_scale(knots, curve),
+        ),
     )
 
 
@@ -379,6 +385,16 @@ def _patch_rms(
         groups = np.split(residual[order], starts)
         medians += [float(np.median(group)) for group in groups if len(group) >= side]
     return float(np.sqrt(np.mean(np.square(medians)))) if medians else float("nan")
+
+
+def _of_scale(knots: Float64, curve: Float64) -> list[str]:
+    slope, constant = np.polyfit(knots, curve, 1)
+    if abs(slope) < _MAX_SCALE_ERROR or abs(constant) > _MAX_CONSTANT * abs(slope) * knots.mean():
+        return []
+    return [
+        f"ranges are {100 * abs(slope):.1f} % too {'long' if slope > 0 else 'short'}, which those "
+        "of a ToF camera hardly are: measure a square of the board, as printers scale it"
+    ]
 
 
 def _warnings(views: Sequence[PlaneView], covered: float) -> list[str]:

@@ -89,6 +89,8 @@ class Card:
             if any(self.drifts[name].change is not None for name in self.changed):
                 return f"Drift: the {labels} of this camera change{s} with time."
             return f"Drift, or unlike places: the {labels} differ{s} between the results."
+        if all(drift.change is None for drift in self.drifts.values()):
+            return "No quantity differs between the results by more than its uncertainty."
         return "No drift: no quantity changes with time by more than its uncertainty."
 
     @property

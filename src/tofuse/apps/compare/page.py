@@ -118,14 +118,14 @@ def compare_scene(comparison: Comparison) -> tuple[scene.Scene, fields.Field]:
     limit = limit_of(comparison)
     missing = np.full(len(unseen), np.nan)
     shown = np.concatenate([found.deviation[rows], missing])
-    axes = np.eye(4)
+    R = reference.surface.R_shown
     # CAD models are z up; seen from above only if what was measured faces there.
     if not reference.surface.is_result and found.normals[:, 2].sum() > 0:
-        axes[1:3, 1:3] = [[0, -1], [1, 0]]
+        R = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     drawn = scene.Scene(
-        points @ axes[:3, :3].T,
+        points @ R.T,
         colors(shown, limit),
-        normals @ axes[:3, :3].T,
+        normals @ R.T,
         total + len(unseen),
         scene.spacing_of(points),
     )

@@ -56,6 +56,8 @@ class Surface:
         Unit of its file.
     eyes
         (E, 3) m, where the cameras were; none where not known.
+    R_shown
+        (3, 3), to axes with y down, in which a result is shown upright.
     """
 
     name: str
@@ -68,6 +70,7 @@ class Surface:
     is_result: bool = False
     unit: str = "m"
     eyes: Float64 = field(default_factory=lambda: np.zeros((0, 3)))
+    R_shown: Float64 = field(default_factory=lambda: np.eye(3))
 
     @property
     def extent(self) -> float:
@@ -113,7 +116,10 @@ def _of_result(result: Reconstruction, name: str) -> Surface:
     model = result.cloud if result.mesh is None or not len(result.mesh) else result.mesh
     surface = _of_record(model.record().shifted(result.shift), name)
     eyes = result.trajectory[result.has_pose, :3, 3] + result.shift
-    return replace(surface, shared_m=_shared_sigma(result), is_result=True, eyes=eyes)
+    R_shown = np.diag([1.0, -1.0, -1.0]) @ result.T_up_world[:3, :3]
+    return replace(
+        surface, shared_m=_shared_sigma(result), is_result=True, eyes=eyes, R_shown=R_shown
+    )
 
 
 def _shared_sigma(result: Reconstruction) -> float:

@@ -191,6 +191,15 @@ FORMATS: dict[str, tuple[str, Callable[[_Result, Path], None]]] = {
     "octomap": ("octomap.bt", lambda result, path: result.grid.write_octomap(path)),
 }
 
+# The formats that each option is for.
+_GRIDS = ("occupancy", "esdf", "octomap")
+_TAKE = {
+    "--faces": ("glb", "gltf", "obj", "usdz", "stl"),
+    "--every": ("nerfstudio", "colmap", "rerun", "mcap", *_GRIDS),
+    "--pinhole": ("nerfstudio", "colmap"),
+    "--voxel": _GRIDS,
+}
+
 # Packages that formats need, and the extras that install them.
 _NEEDED = {
     "e57": ("pye57", "scan"),
@@ -237,8 +246,8 @@ def export(
     Raises
     ------
     InputError
-        If the folder contains no result, a format is unknown or lacks its input, or the result was
-        replaced while it was read.
+        If the folder contains no result, a format is unknown or lacks its input, no format has a
+        given option, or the result was replaced while it was read.
     OutputError
         If a file exists already, or can't be written, or another process writes into the folder.
     """
@@ -250,6 +259,14 @@ def export(
         raise InputError(
             f"unknown format {unknown[0]}", where="FORMAT", remedy=f"use one of {available}"
         )
+    given = (faces is not None, every != 1, pinhole, voxel_m is not None)
+    for (option, taking), is_given in zip(_TAKE.items(), given, strict=True):
+        if is_given and not set(taking) & set(formats):
+            raise InputError(
+                f"has no effect on {', '.join(formats)}",
+                where=option,
+                remedy=f"leave it out; it is for {', '.join(taking)}",
+            )
     for name in formats:
         if name in _NEEDED:  # before minutes are spent on other formats
             reading.required_package(*_NEEDED[name], f"tofuse export {name}")

@@ -19,6 +19,7 @@ from tofuse.formats.poses import OPENGL
 # remaining one, as a fraction: with another wrong convention, some motions fit too. All within this
 # factor of the best one are named, as about one axis some are the same.
 _MIN_LEAD, _MIN_LEAD_SIGMAS, _MAX_REMAINING, _EQUAL = np.radians(1.5), 4.0, 0.35, 1.5
+_ROUNDING = 1e-4  # rad, of poses in text files with few digits
 # Shortest distance from which the scale is estimated, as a fraction of the depth, and cosine of its
 # directions; largest factor that is not reported: devices err by less; and within which of a unit's
 # that unit is named.
@@ -35,6 +36,7 @@ _MIN_PAIRS, _VIEWS = 3, 8
 _TURN, _MIN_TURN, _MAX_TURN, _MAX_STRIDE = 0.1, 0.03, 0.25, 60
 # R_robot_camera: a robot has x forward, y left and z up.
 _ROBOT = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+_UNITY = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 def _times(T_given_camera: Float64) -> Callable[[Float64], Float64]:
@@ -62,6 +64,9 @@ _CONVENTIONS: dict[str, Callable[[Float64], Float64]] = {
         lambda poses: np.asarray(se3.inverse(poses) @ OPENGL)
     ),
     "poses of a body with the axes of a robot (x forward, z up)": _times(_ROBOT),
+    "poses with the left-handed axes of Unity (y up, z forward)": (
+        lambda poses: np.asarray(_UNITY @ poses @ _UNITY)
+    ),
     "poses with quaternions in the order w, x, y, z": _reordered(-1),
     "poses with quaternions in the order x, y, z, w": _reordered(1),
     **{
@@ -104,7 +109,9 @@ def difference(estimate: Float64, reference: Float64) -> str | None:
     if as_read.mean() > _MIN_LEAD + best and best <= _MAX_REMAINING * as_read.mean():
         ifs = []
         for name, sides in converted.items():
-            fit = [side for side, error in sides.items() if error.mean() <= _EQUAL * best]
+            fit = [
+                side for side, error in sides.items() if error.mean() <= _EQUAL * best + _ROUNDING
+            ]
             ifs += [f"{' or '.join(fit)} holds {name}"] if fit else []
         return (
             f"the poses differ by {np.degrees(as_read.mean()):.1f} degrees as they are read, and "

@@ -131,7 +131,12 @@ def _fitted(poses: Float64, later: Intp, found: Sequence[Registration | None]) -
         if not total > 0:
             return None
         s = float((weight * slope).sum() / total)
+    # Errors of the given translations make the slope too small, and those of the measured ones make
+    # that of the opposite fit too large: the scale lies between.
+    extent = np.einsum("ni,nij,nj->n", t, W, t)
+    opposite = float((weight * extent).sum() / max((weight * slope).sum(), 1e-300))
     used = int((weight > 0).sum())
     spread = float((weight * squared).sum() / max(weight.sum(), 1e-9))
     sigma = float(np.sqrt(max(spread, 1.0) / total * used / max(used - 1, 1)))
+    sigma = float(np.hypot(sigma, opposite - s))
     return PoseScale(s, sigma, used) if s > 0 and used >= _MIN_PAIRS else None

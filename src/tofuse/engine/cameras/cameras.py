@@ -387,8 +387,8 @@ def _frozen(a: Float32) -> Float32:
 
 
 _MAX_SKEW_PX = 0.005  # a smaller displacement of pixels by skew is neglected
-# Images are stacked along the last axis if the principal point is farther from their centre than
-# this fraction of their size, and than this multiple of that fraction for the other order.
+# Images have another order of axes if the principal point is farther from their centre than this
+# fraction of their size, and than this multiple of that fraction for the other order.
 _MIN_OFFSET, _MIN_OFFSET_RATIO = 0.1, 3.0
 
 
@@ -408,7 +408,7 @@ def pinhole_values(K: Float64, shape: tuple[int, ...], where: str | Path) -> dic
     ------
     InputError
         If it is not such a matrix, or has skew, which a pinhole camera has not; if it shows that
-        the images are stacked along the last axis.
+        the images are transposed, or stacked along the last axis.
     """
     if K.shape != (3, 3) or not np.allclose(K[2], (0, 0, 1)) or K[1, 0] != 0:
         raise InputError(
@@ -422,15 +422,27 @@ def pinhole_values(K: Float64, shape: tuple[int, ...], where: str | Path) -> dic
             where=where,
             remedy="use the rays of the pixels (rays, RayTable), or 0 if it is negligible",
         )
-    offset, offset_if_last = (
-        np.abs(K[:2, 2] / (width, height) - 0.5).max() for height, width in (shape[-2:], shape[:2])
-    )
-    if len(shape) == 3 and offset > max(_MIN_OFFSET, _MIN_OFFSET_RATIO * offset_if_last):
-        raise InputError(
-            f"is that of images of {shape[1]} x {shape[0]} pixels, and depth has shape {shape}: "
-            "frames come first",
-            where=where,
-            remedy="pass numpy.moveaxis(depth, -1, 0)",
-        )
+    if len(shape) == 3:
+        _check_order(K[:2, 2], shape, where)
     (fx, _, cx), (_, fy, cy) = K[:2, :3].astype(float).tolist()
     return {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+
+
+def _check_order(centre: Float64, shape: tuple[int, ...], where: str | Path) -> None:
+    """Refuse images (N, H, W) that are centred on the principal point in another order of axes."""
+
+    def offset(width: int, height: int) -> float:
+        return float(np.abs(centre / (width, height) - 0.5).max())
+
+    for width, height, order, remedy in (
+        (shape[1], shape[0], "frames come first", "numpy.moveaxis(depth, -1, 0)"),
+        (shape[1], shape[2], "rows come before columns", "numpy.swapaxes(depth, 1, 2)"),
+    ):
+        other = offset(width, height)
+        if offset(shape[2], shape[1]) > max(_MIN_OFFSET, _MIN_OFFSET_RATIO * other):
+            raise InputError(
+                f"is that of images of {width} x {height} pixels, and depth has shape {shape}: "
+                f"{order}",
+                where=where,
+                remedy=f"pass {remedy}",
+            )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -50,6 +51,12 @@ def _in_turn(method: Callable[Concatenate[Mapper, P], R]) -> Callable[Concatenat
 
     @wraps(method)
     def call(mapper: Mapper, /, *args: P.args, **options: P.kwargs) -> R:
+        if mapper._process != os.getpid():  # before the lock, which may be held for ever there
+            raise InputError(
+                "belongs to another process, as its threads do",
+                where="mapper",
+                remedy="make the Mapper in the process that uses it",
+            )
         with mapper._lock, signals_as_themselves():
             return method(mapper, *args, **options)
 
@@ -106,7 +113,7 @@ class Mapper:
         self.config = configured(config)
         self._given = config
         self.seed = seed
-        self._lock = RLock()
+        self._lock, self._process = RLock(), os.getpid()
         self.threads = threads if threads is not None else thread_count()
         if self.threads > 1:
             ahead.load_in_background()

@@ -168,7 +168,8 @@ def _hypotheses(found: Deviation, velocity: Float64) -> Iterator[_Hypothesis]:
 def _words(hypothesis: _Hypothesis, theta: Float64, frames: tuple[int, int] | None) -> str:
     size = theta if len(theta) == 6 else np.concatenate([np.zeros(3), np.resize(theta, 3)])
     moved, turned = np.linalg.norm(size[:3]), np.degrees(np.linalg.norm(size[3:]))
-    by = f"{1e3 * moved:.0f} mm and {turned:.2g}\N{DEGREE SIGN}"
+    angle = f"{float(f'{turned:.2g}'):g}\N{DEGREE SIGN}"  # not 2.2e+02
+    by = f"{1e3 * moved:.0f} mm and {angle}"
     match hypothesis.kind:
         case "scale":
             return f"a wrong scale: lengths are {1 + theta[0]:.3g} times the true ones"
@@ -178,7 +179,7 @@ def _words(hypothesis: _Hypothesis, theta: Float64, frames: tuple[int, int] | No
         case "mount":
             return f"a wrong mount: the poses are of a point and directions {by} off the camera's"
         case "turning":
-            return f"rotation drifts along the track, by {turned:.2g}\N{DEGREE SIGN} in total"
+            return f"rotation drifts along the track, by {angle} in total"
         case "drift":
             return f"drift along the track, by {by} in total"
     assert frames is not None

@@ -21,6 +21,7 @@ from tofuse.engine.cameras import (
     Pinhole,
     RayTable,
     pinhole_values,
+    scaled,
 )
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import AmplitudeKind, DepthKind
@@ -532,6 +533,25 @@ def checked_pinhole(K: Float64, size: tuple[int, int], where: str | Path) -> Pin
     """
     (fx, _, cx), (_, fy, cy) = K[:2, :3].astype(float).tolist()
     return checked_lens(Pinhole, size, {"fx": fx, "fy": fy, "cx": cx, "cy": cy}, where)
+
+
+def scaled_lens(camera: Pinhole, size: tuple[int, int], where: str | Path, remedy: str) -> Pinhole:
+    """Return the lens of the same images at another size (width, height).
+
+    Raises
+    ------
+    InputError
+        If that has another aspect ratio: the images are turned or cropped, or of another camera.
+    """
+    width, height = camera.width, camera.height
+    if abs(width * size[1] - height * size[0]) > 0.02 * height * size[0]:
+        raise InputError(
+            f"is of a {width} x {height} image, depth {size[0]} x {size[1]}: another aspect ratio",
+            where=where,
+            remedy=remedy,
+        )
+    with reading.named(where):
+        return scaled(camera, *size)
 
 
 def _color(get: _Fields) -> ColorCamera | None:

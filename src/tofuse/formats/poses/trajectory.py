@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ def read_tum(path: str | Path) -> tuple[Float64, Float64]:
     InputError
         Naming file and line, if a line isn't 8 numbers, or its pose can't be used.
     """
-    rows = list(rows_of(reading.read_text(path)))
+    rows = rows_of(path, reading.read_text(path))
     with reading.about(path, "write 'timestamp tx ty tz qx qy qz qw'"):
         table, lines = numbers_of_rows(rows, path, 8, exactly=True)
         check_times(table[:, 0], path, lines)
@@ -38,12 +39,24 @@ def read_tum(path: str | Path) -> tuple[Float64, Float64]:
     return table[known, 0], poses[known]
 
 
-def rows_of(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield number and cells of each line that is neither empty nor a comment ('#')."""
-    for number, line in enumerate(text.splitlines(), 1):
-        cells = line.split("#", 1)[0].replace(",", " ").split()
-        if cells:
-            yield number, cells
+def rows_of(path: str | Path, text: str) -> list[tuple[int, list[str]]]:
+    """Return number and cells of each line that is neither empty nor a comment ('#').
+
+    Raises
+    ------
+    InputError
+        If the first one has the names of columns, as tables of other programs do.
+    """
+    lines = enumerate(text.splitlines(), 1)
+    rows = [(n, line.split("#", 1)[0].replace(",", " ").split()) for n, line in lines]
+    rows = [(number, cells) for number, cells in rows if cells]
+    if rows and re.fullmatch("[A-Za-z_]{2,}", rows[0][1][0]) and rows[0][1][0].lower() != "nan":
+        raise InputError(
+            "has names instead of numbers",
+            where=f"{path}, line {rows[0][0]}",
+            remedy="begin it with '#'; the columns must be those of TUM's or EuRoC's format",
+        )
+    return rows
 
 
 def numbers_of_rows(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ import numpy as np
 
 from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64, Intp
-from tofuse.engine.errors import InputError
+from tofuse.engine.errors import InputError, InputWarning
 from tofuse.engine.geometry import se3
 from tofuse.formats.files import npz, reading
 from tofuse.formats.poses.trajectory import (
@@ -53,22 +54,39 @@ class TimedPoses:
         (N,) s; None where the format has none.
     frames
         (N,) frame numbers where it has no timestamps: from 0, or as in the names of the images.
+    in_order
+        The file and its number of poses, if it states neither times nor frame numbers.
     """
 
     poses: Float64
     timestamps: Float64 | None = None
     frames: Intp | None = None
+    in_order: tuple[Path, int] | None = None
 
     def of_frames(self, timestamps: Float64, frames: Intp) -> Float64:
         """Return (M, 4, 4) poses of frames with timestamps (M,) and numbers (M,), NaN if unknown.
 
         As many poses as frames, numbered from 0, are those of the frames in their order.
+
+        Warns
+        -----
+        InputWarning
+            If poses without numbers are too few for the frames, so that any may be missing.
         """
         if self.timestamps is not None:
             return associated_poses(timestamps, self.timestamps, self.poses)
         assert self.frames is not None
         if np.array_equal(self.frames, np.arange(len(frames))):
             return self.poses
+        if self.in_order is not None and len(frames) != self.in_order[1] <= frames.max(initial=0):
+            path, rows = self.in_order
+            warnings.warn(
+                f"{path}: has {quantities.count(rows, 'pose')} without times or frame numbers, and "
+                f"the recording {quantities.count(len(frames), 'frame')}: they are taken for the "
+                "first ones; if others have no pose, use a format with times, such as TUM",
+                InputWarning,
+                stacklevel=3,
+            )
         out = np.full((len(frames), 4, 4), np.nan)
         row = {int(number): k for k, number in enumerate(self.frames)}
         for k, number in enumerate(frames.tolist()):
@@ -127,7 +145,7 @@ def read_poses(path: str | Path) -> TimedPoses:
     with reading.about(path, f"use {_SUPPORTED}"):
         if suffix == ".json":
             return _transforms(text, path)
-        rows = list(rows_of(text))
+        rows = rows_of(path, text)
         if not rows:
             raise InputError("contains no poses")
         first_line = text.splitlines()[rows[0][0] - 1]
@@ -177,7 +195,10 @@ def _tum(_rows: _Rows, path: Path) -> TimedPoses:
 
 
 def _known(
-    poses: Sequence[Float64] | Float64, timestamps: Float64 | None = None, frames: Any = None
+    poses: Sequence[Float64] | Float64,
+    timestamps: Float64 | None = None,
+    frames: Any = None,
+    in_order: Path | None = None,
 ) -> TimedPoses:
     """Leave out poses that are NaN, which programs write where tracking failed."""
     stacked = np.reshape(poses, (-1, 4, 4))
@@ -186,6 +207,7 @@ def _known(
         stacked[known],
         None if timestamps is None else timestamps[known],
         None if frames is None else np.array(frames, np.intp)[known],
+        None if in_order is None else (in_order, len(stacked)),
     )
 
 
@@ -210,7 +232,7 @@ def _kitti(rows: _Rows, path: Path) -> TimedPoses:
     out = np.tile(np.eye(4), (len(rows), 1, 1))
     out[:, :3] = table.reshape(-1, 3, 4)
     poses = [_rigid(T, f"{path}, line {line}") for T, line in zip(out, lines, strict=True)]
-    return _known(poses, frames=range(len(out)))
+    return _known(poses, frames=range(len(out)), in_order=path)
 
 
 def _log(rows: _Rows, path: Path) -> TimedPoses:
@@ -264,7 +286,7 @@ def _numpy(path: Path) -> TimedPoses:
     out = np.tile(np.eye(4), (len(table), 1, 1))
     out[:, : table.shape[1]] = table
     poses = [_rigid(T, f"{path}, pose {k}") for k, T in enumerate(out)]
-    return _known(poses, frames=range(len(out)))
+    return _known(poses, frames=range(len(out)), in_order=path)
 
 
 def _frame_numbers(names: Sequence[str]) -> Intp:

@@ -11,7 +11,7 @@ import numpy as np
 
 from tofuse.engine import quantities
 from tofuse.engine.arrays import Float32, Float64, UInt8
-from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths, scaled
+from tofuse.engine.cameras import DISTORTION_ORDER, MODELS, Pinhole, ray_lengths
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
 from tofuse.engine.parts import part
@@ -217,14 +217,7 @@ class _Frame:
                 model = "pinhole"
                 values = {name: values[name] for name in ("fx", "fy", "cx", "cy")}
         camera = camera_file.checked_lens(MODELS[model], pixels, values, self.where)
-        if abs(width * size[1] - height * size[0]) > 0.02 * height * size[0]:
-            raise InputError(
-                f"is of a {width:g} x {height:g} image, depth {size[0]} x {size[1]}: "
-                "another aspect ratio",
-                where=self.where,
-                remedy=_REMEDY,
-            )
-        return scaled(camera, *size)
+        return camera_file.scaled_lens(camera, size, self.where, _REMEDY)
 
     def _focal_length(self, name: str, pixels: float) -> float | None:
         """Focal length in pixels from the field of view; None if not given."""

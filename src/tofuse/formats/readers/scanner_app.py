@@ -30,6 +30,12 @@ class ScannerApp(Reader):
         files = reading.files_named(path, _DEPTH.fullmatch)
         if any(reading.if_file(_file_of_frame(file, "frame", ".json")) for file in files[:9]):
             return Sniff(1.0, f"{len(files)} depth_*.png with frame_*.json")
+        if any(reading.if_file(_file_of_frame(file, "conf", ".png")) for file in files[:9]):
+            return Sniff(
+                Sniff.UNCERTAIN,
+                f"{len(files)} depth_*.png without frame_*.json",
+                "share 'All data' from 3d Scanner App again, as these state the lens",
+            )
         return None
 
     def open(self, path: Path, options: ReaderOptions) -> phones.PhoneSource:

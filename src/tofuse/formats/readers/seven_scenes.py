@@ -110,6 +110,10 @@ def _camera(folder: Path, files: Sequence[Path], default: _Camera, warnings: lis
         info = reading.first_file(*(place / name for name in _INFO))
         if info is not None and _INFO_LENS.encode() in reading.read_head(info, 4096):
             return _read_info(info, warnings)
+    warnings.append(
+        f"no {_INTRINSICS} or info.txt: the camera of 7-Scenes is used "
+        f"({DEFAULT_CAMERA.fx:.0f} px); --camera to change"
+    )
     return default
 
 

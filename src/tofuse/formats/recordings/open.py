@@ -426,6 +426,8 @@ def _unidentified(path: Path, sniffs: dict[str, Sniff], children: list[Path]) ->
                 remedy = f"if the depth images are in {child.name}/, use --camera camera.json "
                 remedy += "(docs/formats.md), or a file of OpenCV or ROS"
                 break
+            if "depth" in child.name.lower() and inputs.files_at(child, ".npy", ".exr"):
+                remedy = f"name {child.name}/ depth/, and add a camera.json (docs/formats.md)"
     elif path.stat().st_size == 0:
         return InputError("is empty", where=path, remedy="copy the file again")
     else:

@@ -210,6 +210,12 @@ def check_timestamps(times: Float64, path: Path, warnings: list[str]) -> None:
 
 
 def interpolated(times: Float64) -> Float64:
-    """Return timestamps (N,) of frames, some of them finite, with the others interpolated."""
-    known, index = np.isfinite(times), np.arange(len(times))
-    return np.where(known, times, np.interp(index, index[known], times[known]))
+    """Return timestamps (N,) of frames, some of them finite, with the others interpolated.
+
+    Before the first and after the last known one they go on with the median step.
+    """
+    known = np.flatnonzero(np.isfinite(times))
+    index, steps = np.arange(len(times)), np.diff(times[known]) / np.diff(known)
+    beyond = index - np.clip(index, known[0], known[-1])
+    step = np.median(steps) if len(steps) else 1.0
+    return np.asarray(np.interp(index, known, times[known]) + beyond * step)

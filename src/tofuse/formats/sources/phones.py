@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.arrays import Float32, Float64, UInt8
-from tofuse.engine.cameras import Pinhole, scaled
+from tofuse.engine.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import POSES_BY, RangeFrame, depth_counts
 from tofuse.engine.quantities import count
 from tofuse.formats.cameras import camera_file
-from tofuse.formats.files import reading
 from tofuse.formats.images import read_color, read_image
 from tofuse.formats.sources.file_source import FileSource
 from tofuse.formats.sources.inputs import read_matrix_pose
@@ -36,8 +35,7 @@ def phone_lens(
 ) -> Pinhole:
     """Return the camera of depth images of `size` from K (3, 3) of larger colour images."""
     full = camera_file.checked_pinhole(K, image_size, where)
-    with reading.named(where):
-        return scaled(full, *size)
+    return camera_file.scaled_lens(full, size, where, "export the images again, not turned")
 
 
 class PhoneSource(FileSource):
