@@ -326,6 +326,7 @@ def test_swapped_bytes_are_detected() -> None:
         replace(f, depth=n.astype(np.float32) / 1000) for f, n in zip(right, noisy, strict=True)
     ]
     assert "bytes" not in str(tofuse.inspect(of(unreadable)).findings)
+    assert "depth_unit" not in codes([f.keep((v % 3 == 0) & (u % 3 == 0)) for f in right])
 
 
 @pytest.mark.parametrize(

@@ -147,6 +147,8 @@ def _roughness_if_swapped(images: Sequence[RangeFrame], unit_m: float) -> float:
         if np.abs(image.depth[image.valid] / unit_m - counts).max() > _MAX_FRACTION:
             return 1.0
         both = image.valid[:, 1:] & image.valid[:, :-1]
+        if not both.any():  # sparse depth
+            continue
         as_read, swapped = (
             np.abs(np.diff(values.astype(float), axis=1))[both].mean() / values.mean()
             for values in (stored, stored.byteswap())
