@@ -110,11 +110,17 @@ class Pinhole:
     def project(self, points: ArrayLike) -> Float64:
         """Project points (..., 3) in m; see `Camera.project`."""
         points = np.asarray(points, float)
-        flat = np.ascontiguousarray(points.reshape(-1, 3))
-        pixels = kernels.project_by_lens(flat, self._lens)
+        pixels = self.extrapolate(points)
         if np.isfinite(self._fold):
-            pixels[np.hypot(flat[:, 0], flat[:, 1]) > self._fold * flat[:, 2]] = np.nan
-        return pixels.reshape(*points.shape[:-1], 2)
+            beyond = np.hypot(points[..., 0], points[..., 1]) > self._fold * points[..., 2]
+            pixels[beyond] = np.nan
+        return pixels
+
+    def extrapolate(self, points: ArrayLike) -> Float64:
+        """Project points also beyond a fold of the distortion, as fits of its coefficients do."""
+        points = np.asarray(points, float)
+        flat = np.ascontiguousarray(points.reshape(-1, 3))
+        return kernels.project_by_lens(flat, self._lens).reshape(*points.shape[:-1], 2)
 
     @cached_property
     def _fold(self) -> float:
