@@ -89,6 +89,33 @@ def test_unreachable_pixels_are_nan() -> None:
     np.testing.assert_allclose(rays[72, 88], [0.005, 0.005], rtol=1e-3)
 
 
+@pytest.mark.parametrize(
+    "camera",
+    [
+        BrownConrady(640, 480, 400.0, 400.0, 319.5, 239.5, -0.35),
+        BrownConrady(640, 480, 400.0, 400.0, 319.5, 239.5, -0.45, 0.05),
+        Fisheye(640, 480, 180.0, 180.0, 319.5, 239.5, -0.2),
+    ],
+    ids=["brown", "brown-2", "fisheye"],
+)
+def test_lenses_end_where_their_distortion_folds_back(camera: Pinhole) -> None:
+    # By brute force: how far from the principal point the lens shows rays, in focal lengths.
+    slopes = np.linspace(0, 5, 50_001)
+    along_row = np.stack([slopes, 0 * slopes, np.ones_like(slopes)], -1)
+    shown = (camera.project(along_row)[:, 0] - camera.cx) / camera.fx
+    last = int(np.nanargmax(shown))
+    assert np.isnan(shown[slopes > 1.01 * slopes[last]]).all()  # not back into the image
+    assert (np.diff(shown[: last - 20]) > 0).all()
+    rays = camera.rays().astype(float)
+    v, u = np.mgrid[: camera.height, : camera.width]
+    pixels = np.stack([u - camera.cx, v - camera.cy], -1) / camera.fx
+    known, distance = np.isfinite(rays).all(-1), np.linalg.norm(pixels, axis=-1)
+    np.testing.assert_array_equal(known[distance < shown[last] - 1e-4], True)
+    np.testing.assert_array_equal(known[distance > shown[last] + 1e-4], False)
+    assert ((rays * pixels).sum(-1)[known] > 0).all()  # each on its pixel's side
+    assert np.linalg.norm(rays[known], axis=-1).max() < 1.01 * slopes[last]
+
+
 def test_equal_ray_tables_share_cache_entry() -> None:
     rays = np.array(PINHOLE.rays())
     rays[0, 0], rays[3, 3] = np.nan, 0.0

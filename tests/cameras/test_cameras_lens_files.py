@@ -12,6 +12,7 @@ import pytest
 from made_lens_files import OPENCV, written
 from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Rational
 from tofuse.engine.errors import InputError
+from tofuse.formats.cameras import lenses
 from tofuse.formats.cameras.camera_file import load_camera, read_lens_file
 
 ROS = """image_width: 800
@@ -181,3 +182,11 @@ def test_a_lens_is_never_guessed(tmp_path: Path, text: str, message: str) -> Non
     with pytest.raises(InputError) as caught:
         read_lens_file(written(tmp_path, "a.yaml", text))
     assert message in str(caught.value)
+
+
+def test_inverse_lens_that_folds_in_view_has_no_forward_lens() -> None:
+    lens = BrownConrady(640, 480, 400.0, 400.0, 320.0, 240.0, k1=-0.5)
+    table = lenses.inverse_brown(lens)
+    assert np.isnan(table.rays()).any()
+    with pytest.raises(InputError, match="too much distortion"):
+        lenses.forward_brown(table, lens)

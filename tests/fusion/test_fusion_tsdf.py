@@ -11,12 +11,13 @@ import pytest
 from ball_views import CAMERA, EYE, around_a_ball, frame_of, look, plane_range, sphere_range
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.spill import Spill
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
 from tofuse.engine.fusion.block_kernels import block_of, voxel_of
+from tofuse.engine.fusion.layout import Layout
 from tofuse.engine.fusion.model import ModelBuilder
 from tofuse.engine.fusion.options import Fusion
 from tofuse.engine.fusion.range_view import DECODED, CameraCorrection, RangeView
-from tofuse.engine.fusion.tsdf import fuse_surface
+from tofuse.engine.fusion.tsdf import Volume, fuse_surface
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.fixed_pattern import FixedPattern
 from tofuse.engine.refinement.refinement import without_errors
@@ -243,6 +244,31 @@ def test_views_without_colour_do_not_darken() -> None:
     mesh = fuse_surface(views, np.stack([EYE] * 4), Fusion(voxel_m=0.03))
     np.testing.assert_array_equal(np.unique(mesh.color, axis=0), [[200, 0, 0]])
     assert (mesh.views == 4).all()
+
+
+@pytest.mark.parametrize("scale", [1, 8])  # from 4 on, images are stored at half resolution
+@pytest.mark.parametrize("channel", ["color_image", "amplitude_image"])
+def test_surfaces_do_not_darken_where_known_colours_end(scale: int, channel: str) -> None:
+    rows, columns, edge = 72 * scale, 88 * scale, 40 * scale + 1
+    camera = Pinhole(columns, rows, 80.0 * scale, 80.0 * scale, columns / 2, rows / 2)
+    image = np.zeros((rows, columns, 3), np.uint8)
+    image[:, :edge] = 200
+    if channel == "amplitude_image":
+        image = image[..., 0].astype(np.float32)
+        image[: rows // 2, edge:] = SATURATED_AMPLITUDE
+    depth = np.full((rows, columns), 2.0, np.float32)
+    frame = RangeFrame(
+        0, 0.0, camera, depth, amplitude_kind="range_compensated", **{channel: image}
+    )
+    view = RangeView.of(frame)
+    assert len(np.unique(view.intensity)) == 2  # the colour, and unknown
+    layout = Layout.of([view], EYE[None], 0.03)
+    volume = Volume.of(layout, layout.single_region())
+    volume.add([view], EYE[None])
+    intensity = volume.piece().intensity
+    known = intensity[:, 0] > 0
+    assert 0.3 < known.mean() < 0.7
+    np.testing.assert_allclose(intensity[known], view.intensity.max(), rtol=1e-5)
 
 
 def test_albedo_is_grey_and_does_not_fall_with_range() -> None:

@@ -16,6 +16,7 @@ from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry.quaternion import to_matrix
+from tofuse.formats.geometry.e57 import write_e57
 from tofuse.formats.geometry.las import write_las
 
 
@@ -271,6 +272,15 @@ def test_e57(tmp_path: Path) -> None:
     (tmp_path / "more.e57").write_bytes(path.read_bytes())
     folder = tofuse.open(tmp_path)  # scanners write a file for each scan
     assert (folder.format, len(folder)) == ("e57", 4)
+
+
+def test_e57_keeps_the_digits_of_map_coordinates(tmp_path: Path) -> None:
+    pytest.importorskip("pye57")
+    points = POINTS + np.array([500_000.0, 5_400_000.0, 300.0])
+    sigma = np.linspace(0, 1, len(points), dtype=np.float32)
+    write_e57(tmp_path / "a.e57", GeometryRecord(points, scalars={"sigma": sigma}))
+    frame = tofuse.open(tmp_path / "a.e57")[0]
+    np.testing.assert_allclose(frame.points + frame.shift, points, rtol=0, atol=1e-5)
 
 
 def test_damaged_scans_are_refused_in_one_line(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from tofuse.apps.report.extras import ReportExtras
 from tofuse.apps.report.fields import fields
 from tofuse.apps.report.packing import pack
 from tofuse.apps.report.scene import make_scene, packed
+from tofuse.apps.report.section_frames import path_length
 from tofuse.apps.report.sections import write_report
 from tofuse.apps.report.subject import Subject
 from tofuse.engine.cameras.cameras import Pinhole
@@ -32,7 +33,7 @@ from tofuse.engine.fusion.pose_errors import UNKNOWN_M
 from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import LoopRecord
 from tofuse.engine.quality.frame_samples import FrameSample, FrameSamples
-from tofuse.engine.results.types import Component, FrameRecord, Reason
+from tofuse.engine.results.types import Component, FrameRecord, Reason, SessionRecord
 from unpacked import unpack
 
 
@@ -332,6 +333,22 @@ def test_lost_frames_state_their_reason(shown):
     )
     assert shown.row("frames 9–10")[1:] == ["2", "lost", "too few correspondences: 31 of 1000"]
     assert shown.row("frame 15")[2:] == ["skipped", "depth/000015.png: is truncated"]
+
+
+def test_path_length_excludes_steps_between_cameras_and_sessions():
+    result, _ = make_room()
+    walk = np.tile(np.eye(4), (24, 1, 1))
+    camera = np.arange(24) % 2
+    walk[:, 0, 3] = 0.1 * (np.arange(24) // 2)
+    walk[:, 1, 3] = 5.0 * camera  # two cameras of a rig, 5 m apart
+    rig = {**result.recording, "rig": {"cameras": ["a", "b"], "of_frames": camera.tolist()}}
+    result = replace(result, trajectory=walk, recording=rig)
+    assert path_length(Subject.of(result, ReportExtras("room"))) == pytest.approx(1.1)
+    sessions = tuple(SessionRecord(n, n, {}, {}, 12 * k, 12, np.eye(4)) for k, n in enumerate("ab"))
+    walk = np.tile(np.eye(4), (24, 1, 1))
+    walk[:, 0, 3] = np.where(np.arange(24) < 12, 0.1, -0.2) * np.arange(24)
+    result = replace(result, trajectory=walk, recording={}, sessions=sessions)
+    assert path_length(Subject.of(result, ReportExtras("room"))) == pytest.approx(1.1 + 2.2)
 
 
 def test_packed_arrays_round_trip():

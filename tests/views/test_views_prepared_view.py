@@ -103,6 +103,16 @@ def test_sparse_depth_is_downsampled_until_dense() -> None:
     assert view.planar_fraction > 0.8
 
 
+def test_saturated_pixels_do_not_darken_their_neighbours() -> None:
+    frame = wall(Pinhole(640, 480, 840.0, 840.0, 319.5, 239.5), amplitude=None)  # halved
+    color = np.full((480, 640, 3), 200, np.uint8)
+    whole = prepare_view(replace(frame, color_image=color.copy()), OPTIONS).albedo[..., 0]
+    color[:, 301:340] = 255
+    holed = prepare_view(replace(frame, color_image=color), OPTIONS).albedo[..., 0]
+    assert np.isnan(holed).sum() > np.isnan(whole).sum()
+    assert np.nanmax(np.abs(holed - whole)) < 0.01
+
+
 def test_connected_gaps_keep_resolution() -> None:
     camera = Pinhole(320, 240, 420.0, 420.0, 159.5, 119.5)
     frame = wall(camera, 0.005)

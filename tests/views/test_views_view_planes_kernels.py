@@ -51,8 +51,10 @@ def halve_twin(z, value, variance, jump):
             middle = np.sort(block)[min(1, len(block) - 1)]
             near = np.abs(block - middle) <= jump * middle
             z_out[i, j] = 1 / np.mean(1 / block[near])
-            value_out[i, j] = amount[near].mean()
-            variance_out[i, j] = spread[near].sum() / near.sum() ** 2
+            for out, numbers in ((value_out, amount[near]), (variance_out, spread[near])):
+                if numbers.any():
+                    out[i, j] = numbers[numbers > 0].mean()
+            variance_out[i, j] /= near.sum()
     return z_out, value_out, variance_out
 
 
@@ -63,12 +65,15 @@ def halved(z, value, variance=None, jump=0.02):
     return out
 
 
+@pytest.mark.parametrize("unknown", [0.0, 0.3])
 @pytest.mark.parametrize("shape", [(20, 16), (21, 17)])
-def test_halving_matches_slow_twin(shape):
+def test_halving_matches_slow_twin(shape, unknown):
     rng = np.random.default_rng(1)
     z = rng.choice([0, 1.0, 1.5, 1.51, 3], shape).astype(np.float32)
     z += np.where(z > 0, rng.uniform(0, 0.01, shape), 0).astype(np.float32)
     value, variance = rng.uniform(1, 9, (2, *shape)).astype(np.float32)
+    for image in (value, variance):
+        image[rng.random(shape) < unknown] = 0
     twin = halve_twin(z, value, variance, 0.02)
     for found, wanted in zip(halved(z, value, variance), twin, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-6)

@@ -339,7 +339,7 @@ def _least_squares(
 
     def errors(x: Float64) -> Float64:
         camera, poses = unpacked(x)
-        seen = camera.project(np.concatenate([se3.transform(T, points) for T in poses]))
+        seen = camera.extrapolate(np.concatenate([se3.transform(T, points) for T in poses]))
         return (seen - np.concatenate([view.corners for view in views])).ravel()
 
     # A pose affects the corners of its own view only, so all poses are perturbed at once.

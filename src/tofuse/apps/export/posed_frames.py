@@ -14,7 +14,7 @@ from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.cameras import Camera, Pinhole, scaled
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import CloudFrame, RangeFrame, Recording
-from tofuse.engine.fusion import texture
+from tofuse.engine.fusion import albedo
 from tofuse.engine.noise import noise_model_for
 from tofuse.engine.sensor import CameraErrors, Corrector
 from tofuse.formats.cameras import Rectifier, pinhole_of
@@ -149,7 +149,7 @@ class _Renderer:
         """(H, W, 3) RGB of a frame, black where unknown; None without colour and amplitude."""
         if frame.color_image is not None and frame.color_registered:
             return frame.color_image
-        intensity = texture.albedo(frame)
+        intensity = albedo(frame)
         if intensity is None:
             return None
         lit = intensity > 0

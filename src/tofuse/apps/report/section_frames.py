@@ -39,13 +39,11 @@ def frames(s: Subject) -> Values:
     runs = words.runs((r.index, r.status, r.reason) for r in records)
     runs = [run for run in runs if run[3] != "tracked"]
     counts = [(name, statuses.count(name)) for name in words.STATUSES]
-    path = s.scene.after[:, :3, 3]
-    travelled = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     return {
         "counts": [(f"frames {name}", f"{number:,}") for name, number in counts],
         "triangles": None if s.result.mesh is None else len(s.result.mesh.faces),
         "points": s.scene.total,
-        "travelled": travelled if len(path) > 1 else None,
+        "travelled": path_length(s),
         "lanes": [*words.STATUSES, *(["component"] if len(components) > 1 else [])],
         "strip": _strip(records, components),
         "label": ", ".join(f"{n} {name}" for name, n in counts),
@@ -58,6 +56,26 @@ def frames(s: Subject) -> Values:
         "more": words.more(len(runs) - ROWS),
         "apart": any(not c.connected for c in components),
     }
+
+
+def path_length(s: Subject) -> float | None:
+    """Return the length of the path in m; None without two poses.
+
+    Steps between sessions, and between the cameras of a rig, are no motion: the lengths of sessions
+    add up, and of the cameras of a rig that with the longest path counts.
+    """
+    rig = s.result.recording.get("rig")
+    of_frames = rig["of_frames"] if rig else []
+    count = len(s.index)
+    camera = np.array(of_frames, int) if len(of_frames) == count else np.zeros(count, int)
+    starts = [session.first for session in s.result.sessions[1:]]
+    session = np.searchsorted(starts, s.index, side="right")
+    lengths = np.zeros((len(starts) + 1, camera.max(initial=0) + 1))
+    for row, column in np.ndindex(*lengths.shape):
+        own = s.result.has_pose & (session == row) & (camera == column)
+        steps = np.diff(s.result.trajectory[own, :3, 3], axis=0)
+        lengths[row, column] = np.linalg.norm(steps, axis=1).sum()
+    return float(lengths.max(1).sum()) if s.result.has_pose.sum() > 1 else None
 
 
 def _strip(

@@ -40,7 +40,7 @@ class Camera(Protocol):
         ...
 
     def project(self, points: ArrayLike) -> Float64:
-        """Return pixel coordinates (..., 2) = (u, v) of points (..., 3) in m; NaN if z <= 0."""
+        """Return pixels (..., 2) = (u, v) of points (..., 3) in m; NaN where there is none."""
         ...
 
 
@@ -67,6 +67,9 @@ def _derived(camera: Camera) -> tuple[Float32, Bool | None]:
         derived = (lengths, unknown if unknown.any() else None)
         _cache[camera] = derived
     return derived
+
+
+_CHECKED_ANGLES = 2000  # to the axis, at which a lens is checked for a fold
 
 
 @dataclass(frozen=True)
@@ -107,8 +110,28 @@ class Pinhole:
     def project(self, points: ArrayLike) -> Float64:
         """Project points (..., 3) in m; see `Camera.project`."""
         points = np.asarray(points, float)
+        pixels = self.extrapolate(points)
+        if np.isfinite(self._fold):
+            beyond = np.hypot(points[..., 0], points[..., 1]) > self._fold * points[..., 2]
+            pixels[beyond] = np.nan
+        return pixels
+
+    def extrapolate(self, points: ArrayLike) -> Float64:
+        """Project points also beyond a fold of the distortion, as fits of its coefficients do."""
+        points = np.asarray(points, float)
         flat = np.ascontiguousarray(points.reshape(-1, 3))
         return kernels.project_by_lens(flat, self._lens).reshape(*points.shape[:-1], 2)
+
+    @cached_property
+    def _fold(self) -> float:
+        """Length of (x/z, y/z) beyond which the distortion folds rays back; infinite without it."""
+        if type(self) is Pinhole:
+            return np.inf
+        slope = np.tan(np.linspace(0, np.pi / 2, _CHECKED_ANGLES, endpoint=False))
+        rays = np.stack([slope, np.zeros_like(slope)], -1)
+        distorted = kernels.distort(rays, self._lens._replace(p1=0.0, p2=0.0))[:, 0]
+        folded = np.flatnonzero(np.diff(distorted) <= 0)
+        return float(slope[folded[0]]) if len(folded) else np.inf
 
     @cached_property
     def _lens(self) -> kernels.Lens:
@@ -146,7 +169,8 @@ class Pinhole:
             if len(active) == 0:
                 break
         bad = ~(np.abs(self._distort(out) - xy).max(-1) < 1e-7)
-        out[bad] = np.nan
+        # A polynomial has other solutions beyond its fold, even on the opposite side.
+        out[bad | (np.hypot(*out.T) > self._fold)] = np.nan
         return out.reshape(shape)
 
 
@@ -203,7 +227,9 @@ class Fisheye(Pinhole):
                 theta = theta - np.clip((estimate - distorted) / slope, -0.3, 0.3)
         estimate = self._distorted_angle(theta)
         converged = (
-            (np.abs(estimate - distorted) < 1e-7) & (theta >= 0) & (theta < np.pi / 2 - 1e-3)
+            (np.abs(estimate - distorted) < 1e-7)
+            & (theta >= 0)
+            & (theta < min(np.pi / 2 - 1e-3, np.arctan(self._fold)))
         )
         scale = np.where(
             distorted > 1e-9, np.tan(theta) / np.where(distorted > 1e-9, distorted, 1), 1.0

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from tofuse.engine.fusion.model import Model, ModelBuilder
     from tofuse.engine.fusion.options import Fusion
     from tofuse.engine.fusion.pose_errors import UNKNOWN_M, with_pose_errors
+    from tofuse.engine.fusion.range_view import albedo
     from tofuse.engine.fusion.texture import Textured
     from tofuse.engine.fusion.upright import T_up_world
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Bool, Float32, Float64, Int8, UInt8, UInt16
 from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.compute import Spill, median
-from tofuse.engine.frames import CloudFrame, RangeFrame
+from tofuse.engine.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
 from tofuse.engine.fusion.tsdf_kernels import StoredView, mark_jumps, pack_view, shrink_to_planes
 from tofuse.engine.refinement import fixed_pattern
 from tofuse.engine.views import (
@@ -274,17 +274,40 @@ def _weight_codes(weight: Float32) -> UInt8:
     return np.where(positive, np.clip(code, 1, 255), 0).astype(np.uint8)
 
 
-def _intensity(frame: RangeFrame, shape: tuple[int, ...]) -> NDArray[np.float16] | UInt8 | None:
-    if frame.color_image is not None:
-        return np.round(_area_mean(frame.color_image.astype(np.float32), shape)).astype(np.uint8)
+def albedo(frame: RangeFrame) -> Float32 | None:
+    """Return the albedo (H, W) of a frame in counts times m^2, -1 where unknown.
+
+    None if it has no amplitude.
+    """
     if frame.amplitude_image is None:
         return None
-    amplitude = frame.amplitude_image
+    z, amplitude = np.asarray(frame.z, np.float32), frame.amplitude_image
+    unknown = ~(amplitude > 0) | (amplitude >= SATURATED_AMPLITUDE) | (z <= 0)
     if frame.amplitude_kind != "range_compensated":
-        # Compensated for the falloff with the squared range: proportional to the albedo.
-        amplitude = amplitude * np.square(frame.z * ray_lengths(frame.camera))
-    intensity = np.sqrt(np.maximum(_area_mean(np.nan_to_num(amplitude), shape), 0))
+        amplitude = amplitude * np.square(z * ray_lengths(frame.camera))
+    return np.where(unknown, -1, np.nan_to_num(amplitude)).astype(np.float32)
+
+
+def _intensity(frame: RangeFrame, shape: tuple[int, ...]) -> NDArray[np.float16] | UInt8 | None:
+    """Return the means of the known colours, or albedos, of blocks of pixels; 0 where unknown."""
+    if frame.color_image is not None:
+        known = np.asarray((frame.color_image > 0).any(-1), np.bool_)
+        return np.round(_known_mean(frame.color_image, known, shape)).astype(np.uint8)
+    light = albedo(frame)
+    if light is None:
+        return None
+    known = np.asarray(light >= 0, np.bool_)
+    intensity = np.sqrt(_known_mean(np.where(known, light, 0), known, shape))
     return np.minimum(intensity, 65000).astype(np.float16)
+
+
+def _known_mean(image: NDArray[np.generic], known: Bool, shape: tuple[int, ...]) -> Float32:
+    """Return means of the known pixels of blocks; the others of `image` are 0."""
+    mean = _area_mean(image.astype(np.float32), shape)
+    if known.all():
+        return mean
+    share = _area_mean(known.astype(np.float32), shape)
+    return np.asarray((mean.T / np.maximum(share, 1e-6).T).T, np.float32)
 
 
 def _area_mean(image: Float32, shape: tuple[int, ...]) -> Float32:

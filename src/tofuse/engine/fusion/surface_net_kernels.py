@@ -27,7 +27,7 @@ class Vertices(NamedTuple):
     points, normals
         (N, 3) world frame, m, and (N, 3) normalised gradient.
     colors
-        (N, C) mean colour of the corners that have one.
+        (N, C) mean colour of the corners that have one; 0 if none has.
     sigma
         (N,) inverse root of the corners' mean weight, m.
     views
@@ -157,9 +157,12 @@ def make_vertices(
                 d[q >> 2, (q >> 1) & 1, q & 1] = distance[m, w]
                 total += weight[m, w]
                 max_views = max(max_views, view_count[m, w])
-                view_sum += view_count[m, w]
+                has_color = False
                 for s in range(channels):
+                    has_color = has_color or color[m, w, s] > 0
                     color_sum[s] += view_count[m, w] * color[m, w, s]
+                if has_color:
+                    view_sum += view_count[m, w]
             crossing_sum[:] = 0
             g[:] = 0
             crossings = 0
@@ -185,7 +188,7 @@ def make_vertices(
                 # A gradient of 0 has no direction; any unit vector will do.
                 normals[row, axis] = g[axis] / length if length > 0 else np.float64(axis == 2)
             for s in range(channels):
-                colors[row, s] = color_sum[s] / view_sum
+                colors[row, s] = color_sum[s] / max(view_sum, 1.0)
             sigmas[row] = 1 / np.sqrt(total / 8)
             views[row] = max_views
             row += 1

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, UInt8
-from tofuse.engine.cameras import Camera, ray_lengths
+from tofuse.engine.cameras import Camera
 from tofuse.engine.compute import job_pool, run_all, run_chunks
-from tofuse.engine.frames import SATURATED_AMPLITUDE, RangeFrame
+from tofuse.engine.frames import RangeFrame
 from tofuse.engine.fusion.atlas import MARGIN, Atlas, chart_atlas, unwrap
 from tofuse.engine.fusion.atlas_kernels import (
     NO_TRIANGLE,
@@ -30,6 +30,7 @@ from tofuse.engine.fusion.color_alignment import Shown, aligned_poses
 from tofuse.engine.fusion.display_surface import TOLERANCE_FRACTION, TOLERANCE_M, reduced, reduction
 from tofuse.engine.fusion.drawing import display_colors
 from tofuse.engine.fusion.mesh import Mesh
+from tofuse.engine.fusion.range_view import albedo
 from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.views import Projection, projection_of
 
@@ -169,20 +170,6 @@ class TextureView:
         sums = cv2.resize(self.small * known[..., None], size, interpolation=cv2.INTER_AREA)
         share = cv2.resize(known, size, interpolation=cv2.INTER_AREA)[..., None]
         return np.ascontiguousarray(sums / np.maximum(share, 1e-3), np.float32)
-
-
-def albedo(frame: RangeFrame) -> Float32 | None:
-    """Return the albedo (H, W) of a frame in counts times m^2, -1 where unknown.
-
-    None if it has no amplitude.
-    """
-    if frame.amplitude_image is None:
-        return None
-    z, amplitude = np.asarray(frame.z, np.float32), frame.amplitude_image
-    unknown = ~(amplitude > 0) | (amplitude >= SATURATED_AMPLITUDE) | (z <= 0)
-    if frame.amplitude_kind != "range_compensated":
-        amplitude = amplitude * np.square(z * ray_lengths(frame.camera))
-    return np.where(unknown, -1, np.nan_to_num(amplitude)).astype(np.float32)
 
 
 def textured(mesh: Mesh, views: Sequence[TextureView], poses: Float64, size: int) -> Textured:

@@ -32,12 +32,13 @@ def halve(
 
     Of each 2 x 2 pixels, those whose depth is within `jump` (relative) of the second nearest are
     averaged: their inverse depths and their `value`. Pixels with depth 0 are invalid. `variance`,
-    that of z, becomes the variance of the mean of independent values.
+    that of z, becomes the variance of the mean of independent values. Unknown values and variances
+    are taken for the mean of the others.
 
     Parameters
     ----------
     z, value, variance
-        (H, W) depth in m, any other channel, variance in m^2.
+        (H, W) depth in m, any other channel, variance in m^2; the last two are 0 where unknown.
     z_out, value_out, variance_out
         (H // 2, W // 2), written.
     """
@@ -50,8 +51,17 @@ def halve(
             p, q = z[2 * i, 2 * j], z[2 * i, 2 * j + 1]
             r, t = z[2 * i + 1, 2 * j], z[2 * i + 1, 2 * j + 1]
             low = min(min(p, q), min(r, t))
-            if low > 0 and max(max(p, q), max(r, t)) - low <= jump * low:  # the common case
-                u, v = 2 * i, 2 * j
+            u, v = 2 * i, 2 * j
+            known = (
+                min(min(value[u, v], value[u, v + 1]), min(value[u + 1, v], value[u + 1, v + 1]))
+                > 0
+                and variance[u, v] > 0
+                and variance[u, v + 1] > 0
+                and variance[u + 1, v] > 0
+                and variance[u + 1, v + 1] > 0
+            )
+            # The common case.
+            if low > 0 and known and max(max(p, q), max(r, t)) - low <= jump * low:
                 z_out[i, j] = 4 / (1.0 / p + 1.0 / q + 1.0 / r + 1.0 / t)
                 value_out[i, j] = 0.25 * (
                     (value[u, v] + value[u, v + 1]) + (value[u + 1, v] + value[u + 1, v + 1])
@@ -86,15 +96,21 @@ def halve(
             value_sum = 0.0
             variance_sum = 0.0
             count = 0
+            values = 0
+            variances = 0
             for k in range(n):
                 if abs(d[k] - reference) <= jump * reference:
                     w_sum += 1.0 / d[k]
-                    value_sum += a[k]
-                    variance_sum += s[k]
                     count += 1
+                    if a[k] > 0:
+                        value_sum += a[k]
+                        values += 1
+                    if s[k] > 0:
+                        variance_sum += s[k]
+                        variances += 1
             z_out[i, j] = count / w_sum
-            value_out[i, j] = value_sum / count
-            variance_out[i, j] = variance_sum / (count * count)
+            value_out[i, j] = value_sum / max(values, 1)
+            variance_out[i, j] = variance_sum / (max(variances, 1) * count)
 
 
 @kernel

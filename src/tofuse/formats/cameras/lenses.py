@@ -36,6 +36,8 @@ def forward_brown(table: RayTable, lens: BrownConrady) -> BrownConrady:
     rays = table.rays()[::step, ::step].reshape(-1, 2).astype(float)
     v, u = np.mgrid[: lens.height : step, : lens.width : step]
     slopes = (np.stack([u, v], axis=-1).reshape(-1, 2) - centre) / focal
+    known = np.isfinite(rays).all(-1)
+    rays, slopes = rays[known], slopes[known]
     x, y = rays.T
     r2 = x * x + y * y
     radial = np.stack([r2, r2**2, r2**3], axis=-1)
@@ -53,7 +55,7 @@ def forward_brown(table: RayTable, lens: BrownConrady) -> BrownConrady:
     )
     k1, k2, k3, p1, p2 = np.linalg.lstsq(rows, (slopes - rays).T.ravel(), rcond=None)[0]
     fitted = replace(lens, k1=float(k1), k2=float(k2), k3=float(k3), p1=float(p1), p2=float(p2))
-    if not np.nanmax(np.abs(fitted.project(homogeneous(rays)) - slopes * focal - centre)) < 0.5:
+    if not np.abs(fitted.project(homogeneous(rays)) - slopes * focal - centre).max() < 0.5:
         raise InputError("has too much distortion to be inverted", where="lens")
     return fitted
 

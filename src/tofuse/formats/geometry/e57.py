@@ -20,7 +20,9 @@ _TOFUSE = "https://tofuse.org/e57"
 
 
 def write_e57(path: str | Path, cloud: GeometryRecord) -> None:
-    """Write a cloud as one scan, in single precision.
+    """Write a cloud as one scan.
+
+    In single precision, except for map coordinates in float64.
 
     Normals use the extension for surface normals, scalars an extension of tofuse, `tofuse:`.
 
@@ -40,7 +42,7 @@ def write_e57(path: str | Path, cloud: GeometryRecord) -> None:
     pye57 = reading.required_package("pye57", "scan", path)
     if not len(cloud):
         raise InputError("there are no points", where=path, remedy="E57 can't store an empty cloud")
-    xyz = np.asarray(cloud.points, np.float32)
+    xyz = cloud.written_points()
     columns: dict[str, NDArray[Any]] = {f"cartesian{a}": xyz[:, k] for k, a in enumerate("XYZ")}
     if cloud.normals is not None:
         table = np.asarray(cloud.normals, np.float32)
@@ -48,7 +50,8 @@ def write_e57(path: str | Path, cloud: GeometryRecord) -> None:
     if cloud.color is not None:
         rgb = np.asarray(cloud.color, np.uint8)
         columns |= {f"color{c}": rgb[:, k] for k, c in enumerate(("Red", "Green", "Blue"))}
-    columns |= {f"tofuse:{key}": np.asarray(values) for key, values in cloud.scalars.items()}
+    for key, values in cloud.scalars.items():
+        columns[f"tofuse:{key}"] = np.asarray(values, "<f4" if values.dtype.kind == "f" else None)
     with atomic.replacing(path) as temporary:
         file = pye57.E57(str(temporary), mode="w")
         try:
@@ -108,8 +111,9 @@ def _write(file: Any, lib: Any, columns: Mapping[str, NDArray[Any]], *, with_nor
     for key, column in columns.items():
         low, high = column.min().item(), column.max().item()
         if column.dtype.kind == "f":
-            values: NDArray[Any] = np.ascontiguousarray(column, np.float32)
-            node = lib.FloatNode(image, low, lib.E57_SINGLE, low, high)
+            values: NDArray[Any] = np.ascontiguousarray(column)
+            precision = lib.E57_DOUBLE if column.dtype == np.float64 else lib.E57_SINGLE
+            node = lib.FloatNode(image, low, precision, low, high)
         else:
             # The library takes uint8 and floats, and converts them to the type in the file.
             is_uint8 = column.dtype == np.uint8
