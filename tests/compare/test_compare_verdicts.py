@@ -194,7 +194,8 @@ def test_a_result_is_shown_upright(room_result) -> None:
     result = replace(result, up=se3.exp([0, 0, 0, 0, 0, 0.5])[:3, :3] @ [0, -1, 0])
     comparison = tofuse.compare(result, result, guess=np.eye(4))
     drawn_points = compare_scene(comparison)[0].points
-    upright = se3.transform(result.T_up_world, result.mesh.vertices) * [1, -1, -1]
+    found = comparison.deviations
+    upright = se3.transform(result.T_up_world, found.points[found.place >= 0]) * [1, -1, -1]
     for end in (np.min, np.max):
         np.testing.assert_allclose(end(drawn_points, 0), end(upright, 0), atol=0.1)
 
@@ -375,3 +376,24 @@ def test_places_without_bound_have_no_slope() -> None:
     np.testing.assert_allclose(steep, [0.1, 0.1, 0.1, 0], atol=1e-9)
     unknown = module._gradients(places, region, deviation, np.full(4, np.inf), 0.012)
     np.testing.assert_array_equal(unknown, 0)
+
+
+def test_what_one_view_alone_saw_is_no_change(part) -> None:
+    """What is wrong in one view is in no sigma, and no other view averages it out."""
+    low = (part.normals[:, 2] > 0.9) & (part.centres[:, 0] < -0.03) & (part.centres[:, 2] < 0.03)
+    corners = part.triangles + np.where(low, 0.004, 0)[:, None, None] * [0, 0, 1]
+    vertices = corners.reshape(-1, 3).astype(np.float32)
+    faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
+    sigma = np.full(len(vertices), 0.0003, np.float32)
+
+    def mesh(views: int) -> Mesh:
+        seen = np.where(np.repeat(low, 3), 1, views).astype(np.int32)
+        return Mesh(vertices, faces, np.zeros_like(vertices), None, sigma, seen)
+
+    found = compared(surface_of(mesh(9)), part, searched=False)
+    assert found.changed == 0
+    assert any("only one view saw" in words for words in found.warnings)
+    # Where most is seen once, nothing is more certain than the rest.
+    once = surface_of(mesh(1))
+    assert once.left_out == 0
+    assert compared(once, part, searched=False).changed > 0

@@ -277,6 +277,20 @@ def test_jump_of_odometry_is_left_out():
     np.testing.assert_allclose(steps[1].T_i_j, se3.inverse(holes[4]) @ holes[8], atol=1e-9)
 
 
+@pytest.mark.parametrize(("wrong", "verified"), [(2, True), (8, False)])
+def test_odometry_that_is_mostly_wrong_bounds_nothing(wrong, verified) -> None:
+    """Where images don't constrain the motion, nothing tells its wrong steps from right ones."""
+    right, graph = walked(0 * NODDING)
+    wall = np.arange(N) >= 13
+    jumping = odometer(right)
+    for k in range(1, wrong + 1):
+        jumping[k:, :3, 3] += [0.5, 0, 0.2]
+    odometry = OdometryEdges(scale=1.0)
+    measured = measure_all((odometry,), sensed(jumping, degenerate=wall), graph)
+    assert {step.i for step in measured.steps} == set(range(wrong, N - 1))
+    assert measured.verified == verified
+
+
 def test_odometry_from_the_same_depth_is_no_evidence():
     """It has the errors of the tracked motion, except where that is extrapolated."""
     graph = tracked(truth(), 0 * NODDING)

@@ -97,6 +97,11 @@ def test_bad_input_is_named(room_result) -> None:
     far[:, :3, 3] = 1000 * (far[:, :3, 3] + 0.1)  # in mm
     with pytest.raises(InputError, match=r"the path: leads .* away from the scan"):
         planning.expect(result, ["sr4000"], poses=far)
+    # Behind the walls, or turned away from what was scanned, as in the axes of another world.
+    for motion in (se3.translation([0, 0, 3.0]), se3.exp([0, 0, 0, 0, np.pi, 0])):
+        elsewhere = result.trajectory @ motion
+        with pytest.raises(InputError, match=r"the path: looks elsewhere than the scan: \d+ %"):
+            planning.expect(result, ["sr4000"], poses=elsewhere)
     with pytest.raises(InputError, match="has no surface"):
         planning.expect(replace(result, mesh=None))
 

@@ -13,7 +13,7 @@ from pose_errors import assert_near, pose_error
 from tofuse.engine.alignment.base import Link, Registration
 from tofuse.engine.geometry import se3
 from tofuse.engine.loops.join_checks import JoinChecks
-from tofuse.engine.loops.joining import Joining
+from tofuse.engine.loops.joining import Joining, _Joiner
 from tofuse.engine.loops.merged_components import MergedComponents, TrackedComponent
 from tofuse.engine.search.verification import MAX_OVERLAP_DISTANCE
 from tofuse.engine.search.view_pair import follow, register_pair
@@ -423,6 +423,31 @@ def test_independent_links_raise_probability(three, min_probability) -> None:
     odds = 19 ** (1 + 0.24 / MAX_OVERLAP_DISTANCE) / 2
     assert same == pytest.approx(odds / (1 + odds), abs=0.02)
     assert min_probability([probable(a[-1], b[0], 0.95), probable(a[0], b[-1], 0.95)]) > same
+
+
+def test_half_of_the_tries_are_away_from_the_links(monkeypatch) -> None:
+    """The most similar views are of one place, of which more evidence adds little."""
+    two = [stretch(c, range(20 * c, 20 * c + 20)) for c in range(2)]
+    tried = []
+
+    def registered(_, first, second):
+        tried.append((first.index, second.index))
+        return probable(first, second, 0.7)
+
+    monkeypatch.setattr(JoinChecks, "confirming", lambda *_: [])
+    monkeypatch.setattr(_Joiner, "_register", registered)
+    joining = Joining(bridge=False, tries=6, min_probability=0.9999)
+    main, other = joining.join(two, [])
+    assert len(tried) == 6
+    # What was reached is known of the group that is not joined.
+    assert (main.reached, 0.7 < other.reached < 0.9999) == (0.0, True)
+
+    def apart(pairs) -> float:
+        turned = np.abs(0.08 * (np.array(pairs)[:, None] - np.array(pairs))).max(2)
+        return turned[np.triu_indices(len(pairs), 1)].min()
+
+    assert apart(tried[:3]) > 0.4
+    assert apart(tried) < 0.3
 
 
 def test_first_group_is_main_on_request(three) -> None:

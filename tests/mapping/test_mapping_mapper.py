@@ -170,6 +170,39 @@ def test_order_kind_and_end_are_checked(frames) -> None:
             call()
 
 
+def test_interrupted_finish_can_be_repeated(frames, monkeypatch) -> None:
+    """Hours of recording are not lost by one Ctrl-C."""
+    mapper, undisturbed = Mapper(CONFIG), Mapper(CONFIG)
+    for frame in frames[:4]:
+        mapper.push(frame)
+        undisturbed.push(frame)
+
+    def interrupted(*_args) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as during:
+        during.setattr("tofuse.engine.mapping.backend.BackEnd._fuse", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            mapper.finish()
+    with pytest.raises(InputError, match="mapper: is finished"):
+        mapper.push(frames[4])
+    result = mapper.finish()
+    assert result.trajectory.tobytes() == undisturbed.finish().trajectory.tobytes()
+    with pytest.raises(InputError, match="mapper: is finished"):
+        mapper.finish()
+
+
+def test_joined_recordings_are_told_apart(frames) -> None:
+    mapper = Mapper()
+    for k, frame in enumerate(frames[:4]):
+        if k == 2:
+            mapper.interrupt()
+        mapper.push(frame)
+    second = [view.index >= frames[2].index for view in mapper.views]
+    assert {True, False} == set(second)
+    assert [view.recording for view in mapper.views] == second
+
+
 def test_mapper_of_another_process_is_refused(frames, monkeypatch):
     """After a fork its threads are missing, and it would wait for them for ever."""
     mapper = Mapper()

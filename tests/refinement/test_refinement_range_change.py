@@ -29,9 +29,12 @@ def right() -> list[SampledView]:
     return [SampledView.of(s, 1500) for s in surfaces(path(VIEWS), noise=0.003)]
 
 
-def checked(views: list[SampledView], factors: np.ndarray) -> CalibrationCheck:
-    """Check views whose depth is scaled."""
-    scaled = [view.scaled(factor) for view, factor in zip(views, factors, strict=True)]
+def checked(views: list[SampledView], factors: np.ndarray, recordings: int = 1) -> CalibrationCheck:
+    """Check views whose depth is scaled, of recordings that are joined."""
+    scaled = [
+        replace(view.scaled(factor), recording=k * recordings // VIEWS)
+        for k, (view, factor) in enumerate(zip(views, factors, strict=True))
+    ]
     refined = refine(scaled, path(VIEWS), OPTIONS)
     return check_calibration(RefinedViews(scaled, refined, OPTIONS))
 
@@ -55,6 +58,39 @@ def test_drift_of_range_is_found(right: list[SampledView]) -> None:
     assert found.frame is None
     assert found.change == pytest.approx(0.08, abs=0.01)
     assert "drifts" in found.in_words()
+
+
+@pytest.mark.parametrize("scales", [(1.0, 1.03), (1.03, 1.0)])
+def test_recording_of_another_scale_is_found(right: list[SampledView], scales) -> None:
+    found = checked(right, np.repeat(scales, VIEWS // 2), recordings=2).range_change
+    assert found is not None
+    assert found.change == pytest.approx(scales[1] / scales[0] - 1, abs=0.003)
+    by = f"{100 * found.change:+.1f} %"
+    assert (
+        found.in_words() == f"differs by {by} in frames 12 to 23 from that of the first recording"
+    )
+
+
+def test_only_the_recording_between_others_differs(right: list[SampledView]) -> None:
+    factors = np.repeat([1.0, 1.03, 1.0], VIEWS // 3)
+    assert checked(right, factors).changed[0] == 0  # neither a step nor a drift
+    assert checked(right, factors, recordings=3).changed[0] > 0.01
+
+
+def test_drift_of_one_recording_is_found(right: list[SampledView]) -> None:
+    factors = np.append(np.linspace(1.0, 1.06, VIEWS // 2), np.ones(VIEWS // 2))
+    found = checked(right, factors, recordings=2).range_change
+    assert found is not None
+    assert found.change == pytest.approx(0.06, abs=0.01)
+    assert f"drifts by {100 * found.change:+.1f} % over frames 0 to 11" == found.in_words()
+
+
+def test_trend_over_recordings_is_no_drift(right: list[SampledView]) -> None:
+    """They have no order in time."""
+    factors = np.repeat([0.988, 0.994, 1.0, 1.006, 1.012, 1.018], VIEWS // 6)
+    assert "drifts" in checked(right, factors).range_change.in_words()
+    assert checked(right, factors, recordings=6).range_change is None
+    assert checked(right, np.ones(VIEWS), recordings=6).changed[0] == 0
 
 
 def test_errors_that_differ_from_room_to_room_are_no_change(right: list[SampledView]) -> None:

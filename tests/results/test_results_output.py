@@ -188,7 +188,9 @@ def test_components_are_in_run_json(tmp_path) -> None:
     assert data["components"][0]["T_main_component"] == np.eye(4).tolist()
     assert data["components"][1]["T_main_component"][0] == [1, 0, 0, 0.5]
     assert data["components"][2]["T_main_component"] is None
-    assert all(set(c) == {"frames", "T_main_component", "joined"} for c in data["components"])
+    assert all(
+        set(c) == {"frames", "T_main_component", "joined", "reached"} for c in data["components"]
+    )
     assert [frame["component"] for frame in data["frames"]] == [0, 1, 2, None]
     assert [frame["index"] for frame in frames_in_main_model(data)] == [0, 1]
 

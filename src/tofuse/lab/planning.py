@@ -17,8 +17,9 @@ import numpy as np
 from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64, Int64
 from tofuse.engine.errors import InputError
+from tofuse.engine.frames import evenly_spaced
 from tofuse.engine.fusion import Mesh as ScannedMesh
-from tofuse.engine.geometry import KdTree, se3, triangles
+from tofuse.engine.geometry import KdTree, se3, triangles, unit_vectors
 from tofuse.engine.mapping import reconstructing
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.results import Reconstruction
@@ -34,6 +35,9 @@ _ANGLE, _DISTANCE, _MAX_FRAMES = 0.06, 0.03, 100
 # Points of the surface of which it is asked whether they are covered, and the distance, relative to
 # the diagonal, within which they are.
 _COVERAGE_POINTS, _COVERED = 5000, 0.005
+# Rays of a pose that are to meet the scan, up to this tangent off its axis and of at most so many
+# poses, and the fraction of them that must, relative to the path of the scan itself.
+_RAYS, _TANGENT, _POSES, _MEETING = 7, 0.4, 50, 0.5
 # Predicted and achieved bounds differ by less than this factor, see benchmarks/plan.py.
 UNCERTAINTY = 1.7
 
@@ -121,6 +125,15 @@ def expect(
             remedy="write it in metres, in the world of the scan",
         )
     scene = scene_of(scan.mesh)
+    meets = _meeting(scene, scan.mesh, path)
+    own = _meeting(scene, scan.mesh, scan.trajectory[scan.has_pose])
+    if meets < _MEETING * own:
+        raise InputError(
+            f"looks elsewhere than the scan: {quantities.percent(meets)} of what its views show is "
+            f"surface of the scan, and {quantities.percent(own)} from the path of the scan itself",
+            where="the path",
+            remedy="write T_world_camera in metres, in the world of the scan, with z forward",
+        )
     depth_m = _typical_depth(scan.mesh, path)
     expected = []
     for model in models:
@@ -194,6 +207,21 @@ def _distance_from(mesh: ScannedMesh, poses: Float64) -> float:
     t = poses[:, :3, 3]
     nearest = t.clip(mesh.vertices.min(0), mesh.vertices.max(0))
     return float(np.linalg.norm(t - nearest, axis=1).max())
+
+
+def _meeting(scene: Scene, mesh: ScannedMesh, poses: Float64) -> float:
+    """Fraction of the rays from poses (N, 4, 4) that meet the front of the surface."""
+    u, v = np.meshgrid(*[np.linspace(-_TANGENT, _TANGENT, _RAYS)] * 2)
+    rays = unit_vectors(np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3))
+    some = evenly_spaced(poses, _POSES)
+    directions = (some[:, None, :3, :3] @ rays[:, :, None])[..., 0].reshape(-1, 3)
+    origins = np.repeat(some[:, :3, 3], len(rays), axis=0)
+    distance = scene.cast(origins, directions).distance.astype(float)
+    met = np.isfinite(distance)
+    points = origins[met] + distance[met, None] * directions[met]
+    nearest, _ = KdTree(mesh.vertices.astype(float)).nearest(points, np.inf)
+    facing = (mesh.normals[nearest] * directions[met]).sum(1) <= 0
+    return float(facing.sum() / len(directions))
 
 
 def _typical_depth(mesh: ScannedMesh, poses: Float64) -> float:

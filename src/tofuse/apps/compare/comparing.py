@@ -50,6 +50,7 @@ _TURNED_SHARE = 0.8
 _NEARER = 0.5  # distance from the guess to a pose, relative to that to a rival which it excludes
 _MAX_RIVAL = 0.9  # fraction of the points of a pose that a rival may explain, to be excluded
 _MAX_FITTED = 0.3  # by which a fit changes a symmetry, as a fraction of it
+_NAMED = 0.005  # fraction of a surface from which it is said that it is not compared
 _SLIDE = 0.02  # along a direction that is not determined, as a fraction of the diagonal
 
 
@@ -362,6 +363,12 @@ def compared(
             f"{measured.name} states no accuracy: only noise is known, and errors that all of its "
             "points share are not (--accuracy)"
         )
+    warnings += [
+        f"only one view saw {quantities.percent(of.left_out)} of {of.name}: nothing confirms that, "
+        "so it is not compared"
+        for of in (measured, reference.surface)
+        if of.left_out > _NAMED
+    ]
     if not np.isfinite(shared_m):
         reason = reason or "the poses of the result are not bounded in some direction"
     regions = tuple(_regions(deviations, reference, tolerance_m, decided=not reason))

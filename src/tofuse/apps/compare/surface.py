@@ -11,7 +11,7 @@ import numpy as np
 from tofuse.apps.pairs import named_view
 from tofuse.apps.results import folders, load_result
 from tofuse.engine import quantities
-from tofuse.engine.arrays import Float64, Int32
+from tofuse.engine.arrays import Bool, Float64, Int32
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import CloudFrame
 from tofuse.engine.fusion import Cloud, GeometryRecord, Mesh
@@ -26,6 +26,8 @@ UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 # Files in mm and models in m differ by 1000 in extent; a part and the room around it by less.
 _MIN_MM_RATIO = 30.0
 _MIN_POINTS = 50
+# Views that confirm a surface.
+_CONFIRMED = 2
 # Points at which the density is measured, and neighbours that it is measured by.
 _DENSITY_POINTS, _DENSITY_NEIGHBOURS = 3000, 12
 Comparable: TypeAlias = Reconstruction | Mesh | Cloud | Float64 | str | os.PathLike[str]
@@ -58,6 +60,8 @@ class Surface:
         (E, 3) m, where the cameras were; none where not known.
     R_shown
         (3, 3), to axes with y down, in which a result is shown upright.
+    left_out
+        Fraction of a fused surface that is left out, as only one view saw it.
     """
 
     name: str
@@ -71,6 +75,7 @@ class Surface:
     unit: str = "m"
     eyes: Float64 = field(default_factory=lambda: np.zeros((0, 3)))
     R_shown: Float64 = field(default_factory=lambda: np.eye(3))
+    left_out: float = 0.0
 
     @property
     def extent(self) -> float:
@@ -94,7 +99,7 @@ def surface_of(given: Comparable, name: str = "") -> Surface:
     if isinstance(given, Reconstruction):
         return _of_result(given, name or "result")
     if isinstance(given, Mesh | Cloud):
-        return _of_record(given.record(), name or type(given).__name__.lower())
+        return _of_model(given, name or type(given).__name__.lower())
     if isinstance(given, np.ndarray):
         CloudFrame.of(given)  # checks them
         return _of_record(GeometryRecord(given), name or "points")
@@ -114,12 +119,30 @@ def surface_of(given: Comparable, name: str = "") -> Surface:
 
 def _of_result(result: Reconstruction, name: str) -> Surface:
     model = result.cloud if result.mesh is None or not len(result.mesh) else result.mesh
-    surface = _of_record(model.record().shifted(result.shift), name)
+    surface = _of_model(model, name, result.shift)
     eyes = result.trajectory[result.has_pose, :3, 3] + result.shift
     R_shown = np.diag([1.0, -1.0, -1.0]) @ result.T_up_world[:3, :3]
     return replace(
         surface, shared_m=_shared_sigma(result), is_result=True, eyes=eyes, R_shown=R_shown
     )
+
+
+def _of_model(model: Mesh | Cloud, name: str, shift: Float64 | None = None) -> Surface:
+    """Return a model as a surface, without that which only one of its views saw.
+
+    What is wrong in one view, such as depth that a phone guesses, or all of a bad frame, is in no
+    sigma, and no other view averages it out. Unless most of the model is seen once: then there is
+    nothing better.
+    """
+    left_out, record = 0.0, model.record()
+    record.check(name)
+    if isinstance(model, Mesh) and len(model.faces) and np.median(model.views) >= _CONFIRMED:
+        confirmed: Bool = np.all((model.views >= _CONFIRMED)[model.faces], axis=1)
+        left_out = float(1 - confirmed.mean())
+        record = model.rows(confirmed).record()
+    if shift is not None:
+        record = record.shifted(shift)
+    return replace(_of_record(record, name), left_out=left_out)
 
 
 def _shared_sigma(result: Reconstruction) -> float:

@@ -34,6 +34,7 @@ from tofuse.engine.mapping import Config, Mapper, from_method, reconstructing
 from tofuse.engine.parts import check_number
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.quality import trajectory_errors
+from tofuse.engine.quantities import percent, probability
 from tofuse.engine.results import Reason, Reconstruction, SessionRecord, in_main_model, verdicts
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.tracking import given
@@ -243,7 +244,15 @@ def _reasons(result: Reconstruction) -> Iterator[Reason]:
         if unjoined and reason.code == "disconnected":
             main = [s.name for s in result.sessions if s.T_main_session is not None]
             text = f"No overlap could be confirmed between {' or '.join(main)} and "
-            yield replace(reason, text=f"{text}{', '.join(unjoined)}. {reason.text}")
+            text += ", ".join(unjoined)
+            reached = max((c.reached for c in result.components), default=0.0)
+            if reached > 0:
+                text += (
+                    f": the likeliest pose is right with a probability of {probability(reached)}, "
+                    f"and {percent(_MIN_PROBABILITY)} are required; more views of the same "
+                    "surfaces, from other directions and places, would raise it"
+                )
+            yield replace(reason, text=f"{text}. {reason.text}")
         else:
             yield reason
 

@@ -177,6 +177,7 @@ def _component(folder: Path, number: int, data: dict[str, Any]) -> Component:
         None if T is None else np.array(T, float).reshape(4, 4),
         data["joined"],
         load_result(component_folder) if T is None and is_result(component_folder) else None,
+        data.get("reached", 0.0),
     )
 
 

@@ -91,7 +91,7 @@ def _content(result: Reconstruction) -> dict[str, Any]:
         "shift_m": result.shift,
         "rig": result.recording.get("rig"),
         "components": [
-            _fields(c, "frames", "T_main_component", "joined") for c in result.components
+            _fields(c, "frames", "T_main_component", "joined", "reached") for c in result.components
         ],
         "sessions": [vars(session) for session in result.sessions],
         "session_pairs": [vars(pair) for pair in result.session_pairs],

@@ -101,8 +101,8 @@ class SensorPriors:
     steps
         Relative poses of consecutive frames, with their information.
     verified
-        Whether the errors of the steps were measured on enough fully constrained registrations.
-        Then the steps bound the errors where images don't constrain the motion.
+        Whether the errors of the steps were measured on enough fully constrained registrations,
+        most of which agree. Then they bound the errors where images don't constrain the motion.
     depth_scale
         Factors on the sigmas of registrations, of translation and of rotation.
     ids
@@ -335,9 +335,12 @@ class OdometryEdges(Bounded, ExternalSensor):
             if used.all() or not used.any():
                 break
         C = (variances * np.repeat(odometry_scale**2, 3))[:, :, None] * np.eye(6)
+        open_step = sensed.degenerate[first] | sensed.degenerate[first + 1]
+        # Odometry that is mostly wrong where images can tell bounds nothing where they can't.
+        is_wrong = not open_step.all() and bool(used[~open_step].mean() < 0.5)
         shared = compared is not None and compared.shares_errors
         if shared:  # it says something only where the depth says nothing
-            used &= sensed.degenerate[first] | sensed.degenerate[first + 1]
+            used &= open_step
         kept = np.flatnonzero(used)
         steps = tuple(
             Measured(
@@ -363,7 +366,7 @@ class OdometryEdges(Bounded, ExternalSensor):
         metric = compared is not None and compared.lengths_agree(scales)
         record = SensorRecord("odometry", len(first), len(kept), scale, text, metric)
         verified = self.scale is not None or (compared is not None and compared.verified)
-        return SensorPriors(steps, records=(record,), verified=verified)
+        return SensorPriors(steps, records=(record,), verified=verified and not is_wrong)
 
     def _variances(self, steps: Float64, seconds: Float64) -> Float64:
         """(K, 6) of motions (K, 4, 4)."""

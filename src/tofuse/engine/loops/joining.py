@@ -18,8 +18,9 @@ other. Each is a vertex, each consistent pair an edge: the maximum clique is acc
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -89,6 +90,8 @@ def maximum_consistent_set(consistent: Bool, weights: Sequence[float] | None = N
 _FRAMES_PER_SEARCH = 50
 # View pairs that may confirm a join whose probability is not required.
 _MAX_CONFIRMING = 4
+# Independence from a link, see `_Joiner._probability`, from which another one says much more.
+_APART = 0.5
 # Largest weight of rival links, relative to the accepted ones.
 _MAX_RIVAL = 0.5
 _MAX_SHIFT = 0.35
@@ -110,12 +113,15 @@ class Group:
         Number of their frames.
     bridged
         Components that only motion over a gap connects to the first one, and its source.
+    reached
+        Largest probability of a join with the main group, if it did not suffice; 0 without any.
     """
 
     T_group_component: Mapping[int, Float64]
     joins: tuple[Join, ...]
     frames: int
     bridged: Mapping[int, JoinKind] = field(default_factory=dict)
+    reached: float = 0.0
 
     def connection(self, component: int) -> JoinKind:
         """Return how a component is connected to the first one."""
@@ -193,6 +199,7 @@ class _Joiner:
         self._links: list[Link] = []
         self._tried: set[tuple[int, int]] = set()  # pairs of views that were registered
         self._refused: set[tuple[int, ...]] = set()
+        self._reached: dict[tuple[int, int], float] = {}  # probabilities between components
         self._proposals: dict[tuple[int, ...], tuple[float, list[Link]]] = {}
         total = sum(len(s.frames) for s in components)
         self._searches = options.searches + len(components) + total // _FRAMES_PER_SEARCH
@@ -247,7 +254,11 @@ class _Joiner:
         return links
 
     def search_links(self) -> None:
-        """Register views of different merged components, most similar first, within the budget."""
+        """Register views of different merged components, most similar first, within the budget.
+
+        If joins need a probability, half of the tries are of pairs away from the links so far, as
+        evidence of one place hardly adds up.
+        """
         views = sorted(self._merged.views.values(), key=lambda v: v.index)
         if len(self._merged.all) < 2 or len(views) < 2:
             return
@@ -262,21 +273,37 @@ class _Joiner:
             i, j = i[separate], j[separate]
             difference = view_descriptors.pairwise_dissimilarity(descriptors, i, j, _MAX_SHIFT)
         order = np.lexsort((j, i, difference))
-        tried: dict[tuple[int, int], int] = {}
-        for k in order.tolist():
+        poses = np.stack([v.T_component_camera for v in views])
+
+        def around(row: int) -> Bool:
+            """(n,) whether views of its component are near one."""
+            change = se3.change_of_view(se3.inverse(poses[row]) @ poses, views[row].depth)
+            near = change < _APART * verification.MAX_OVERLAP_DISTANCE
+            return np.asarray(near & (component == component[row]))
+
+        near_link = np.zeros(len(i), bool)
+        tries, tried = self._options.tries, Counter[tuple[int, int]]()
+        rounds = [(tries, False)]
+        if self._options.min_probability:
+            rounds.insert(0, (tries - tries // 2, True))
+        for (limit, apart), k in itertools.product(rounds, order.tolist()):
             if self._searches < 1 or len(self._merged.all) < 2:
                 return
             first, second = views[i[k]], views[j[k]]
             pair = first.index, second.index
-            if pair in self._tried or self._merged.is_joined(first, second):
-                continue
             components = (int(component[i[k]]), int(component[j[k]]))
-            tried[components] = tried.get(components, 0) + 1
-            if tried[components] > self._options.tries:
+            if (
+                tried[components] >= limit
+                or (apart and near_link[k])
+                or pair in self._tried
+                or self._merged.is_joined(first, second)
+            ):
                 continue
+            tried[components] += 1
             self._tried.add(pair)
             link = self._register(first, second)
             if link is not None:
+                near_link |= around(i[k])[i] & around(j[k])[j]
                 self.add(link)
                 self.decide()
 
@@ -336,7 +363,19 @@ class _Joiner:
         order = sorted(
             range(len(result)), key=lambda k: (not is_main[k], -result[k].frames, first_frames[k])
         )
-        return [result[k] for k in order]
+        main = result[order[0]].T_group_component
+        return [
+            group
+            if group.T_group_component is main
+            else replace(
+                group,
+                reached=max(
+                    self._reached.get(pair, 0.0)
+                    for pair in itertools.product(main, group.T_group_component)
+                ),
+            )
+            for group in (result[k] for k in order)
+        ]
 
     def _register(self, first: View, second: View) -> Link | None:
         """Register two similar views; only an exhaustive search counts against the budget."""
@@ -389,6 +428,8 @@ class _Joiner:
         certain = any(link.certain for link in links)
         min_probability = self._options.min_probability
         probability = self._probability(a, b, [*links, *confirming]) if min_probability else None
+        for pair in itertools.chain(itertools.product(a.T, b.T), itertools.product(b.T, a.T)):
+            self._reached[pair] = max(self._reached.get(pair, 0.0), probability or 0.0)
         if (
             not (certain or len(links) + len(confirming) > 1)
             or (probability is not None and probability < min_probability)

@@ -82,7 +82,11 @@ class Assembly:
                 poses = poses_in_world(component_log, part.group.T_group_component)
                 back_end = BackEnd(self.job, component_log, poses, part.group.joins)
                 result = replace(back_end.run(()), seed=self.seed, threads=self.threads)
-            components.append(Component(ranges, part.T_main_component, part.connection, result))
+            components.append(
+                Component(
+                    ranges, part.T_main_component, part.connection, result, part.group.reached
+                )
+            )
         return numbered, tuple(components)
 
 

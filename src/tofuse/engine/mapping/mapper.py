@@ -122,7 +122,7 @@ class Mapper:
         self._progress = receiver(progress)
         self._sequence = FrameSequence()
         self._log = FrameLog()
-        self._finished = False
+        self._closed = self._finished = False  # takes no more frames; has returned its result
         self._shift: Float64 = np.zeros(3)
         self._up: Float64 | None = None
         self._given_tracker, self._colors = tracker, colors
@@ -289,7 +289,7 @@ class Mapper:
         self._check_open()
         if self._log.entries:
             self._log.interruptions.append(len(self._log.entries))
-        for part in (self._tracker, self._preparation, self._sequence):
+        for part in (self._tracker, self._preparation, self._sequence, self._observations):
             part.interrupt()
         if config is not None:
             self._preparation = Preparation(config, self._preparation.counts)
@@ -335,20 +335,24 @@ class Mapper:
     def finish(self) -> Reconstruction:
         """Join components, close loops, optimise, refine, fuse and judge.
 
+        If it is interrupted, it can be called again.
+
         Raises
         ------
         InputError
             If no frame has a pose.
         """
-        self._check_open()
+        if self._finished:
+            self._check_open()
         self._log.check_posed()
-        self._finished = True
+        self._closed = True
         with self.watch.running():
             with timing("loops"):
                 self._live_poses.finish()
             with timing("fusion"):
                 self._observations.finish()
-            del self._sequence, self._tracker, self._given_tracker  # the last frame, and keyframes
+            for name in ("_sequence", "_tracker", "_given_tracker"):  # the last frame, keyframes
+                vars(self).pop(name, None)
             trim_memory()
             is_fixed = isinstance(self._given, Config)
             if not is_fixed and any(e.T_odometry is not None for e in self._log.entries):
@@ -363,6 +367,7 @@ class Mapper:
             samples=self._observations.samples.all,
         )
         up = self._up if result.up is None else result.up
+        self._finished = True
         return replace(result, diagnostics=diagnostics, shift=self._shift, up=up)
 
     def _check(self, frame: Frame, T_odometry: Float64 | None) -> tuple[Frame, Float64 | None]:
@@ -392,7 +397,7 @@ class Mapper:
         return frame.relative_to(self._shift), T_odometry
 
     def _check_open(self) -> None:
-        if self._finished:
+        if self._closed:
             raise InputError("is finished", where="mapper", remedy="make a new Mapper")
 
 

@@ -124,6 +124,10 @@ class Observations:
         """Store small images of some frames for the report, in the background."""
         self._queue.submit(partial(self._sample, filtered, lost=lost))
 
+    def interrupt(self) -> None:
+        """Begin another recording."""
+        self.views.recording += 1
+
     def finish(self) -> None:
         """Wait until everything is stored."""
         self._queue.finish()

@@ -4,11 +4,13 @@ Another mode or modulation frequency, or warming up, scales the range of later v
 follow it. A scale that all views share is invisible in them, but views of the same surfaces before
 and after a change disagree. Refined views give the change by a step at each view, and by a constant
 drift, with all poses free: one Newton step for each. A likely change is estimated in full: the
-views are scaled by it and aligned again.
+views are scaled by it and aligned again. Joined recordings have no order in time: each may drift or
+change on its own, and as a whole differ from the first one.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +20,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.camera_response import SECTIONS, Linearised, significance_of
 from tofuse.engine.refinement.joint_alignment import RefinedViews, align_views
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, thinned
-from tofuse.engine.stored_views import pair_equations
+from tofuse.engine.stored_views import SampledView, pair_equations
 
 # Makers specify range errors of up to a percent. Those that depend on the distance, or multipath,
 # look like smaller changes, as later views see other distances.
@@ -53,6 +55,8 @@ class RangeChange:
     in_all_sections
         Whether sections of the images agree on it. If not, it is another error of the camera, by
         which steady motion looks like a drift.
+    recording
+        Indices of the first and the last view of the recording that changes, if several are joined.
     """
 
     change: float
@@ -61,6 +65,7 @@ class RangeChange:
     limit: float
     confirmed: bool = True
     in_all_sections: bool = True
+    recording: tuple[int, int] | None = None
 
     @property
     def is_significant(self) -> bool:
@@ -75,9 +80,14 @@ class RangeChange:
 
     def in_words(self) -> str:
         """Describe the change."""
+        by, where = f"by {100 * self.change:+.1f} %", "the recording"
+        if self.recording is not None:
+            where = "frames {} to {}".format(*self.recording)
+            if self.frame == self.recording[0]:
+                return f"differs {by} in {where} from that of the first recording"
         if self.frame is None:
-            return f"drifts by {100 * self.change:+.1f} % over the recording"
-        return f"changes by {100 * self.change:+.1f} % at about frame {self.frame}"
+            return f"drifts {by} over {where}"
+        return f"changes {by} at about frame {self.frame}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +103,7 @@ class LikelyChange:
         (N,) of the scale over the views.
     follow
         (N, 6) twists by which the poses follow, per unit of the scale.
-    frame
+    frame, recording
         As in `RangeChange`.
     limit
         Number of standard deviations that a significant estimate exceeds; that of a large change
@@ -105,6 +115,7 @@ class LikelyChange:
     profile: Float64
     follow: Float64
     frame: int | None
+    recording: tuple[int, int] | None
     limit: float
 
     @property
@@ -120,12 +131,11 @@ def likely_change(linearised: Linearised) -> LikelyChange | None:
     """
     views, pairs = linearised.state.views, linearised.state.pairs
     count = len(views)
-    index = np.array([view.index for view in views], float)
-    drift = (index - index[0]) / max(float(np.ptp(index)), 1.0)
-    first_after = np.arange(_MIN_VIEWS, count - _MIN_VIEWS + 1)
-    steps = (np.arange(count) >= first_after[:, None]).astype(float)
+    drifts, steps = _candidates(views)
+    if not len(steps):
+        return None
     best = int(np.argmax(linearised.scale_scores(steps)))
-    profiles = np.stack([drift, steps[best]])
+    profiles = np.concatenate([drifts, steps[best, None]])
     found = linearised.response_to_scales(profiles)
     scales, sigmas = found.estimate(), found.sigma(pairs, count)
     ratios = np.abs(scales) / np.maximum(sigmas, 1e-12)
@@ -134,10 +144,31 @@ def likely_change(linearised: Linearised) -> LikelyChange | None:
         return None
     # The views that determine a step are few, and it is the best of many (Bonferroni).
     limit = significance_of(float(found.informative_views(pairs, count)[k]), tests=count)
-    frame = views[int(first_after[best])].index if k else None
+    first = views[int(profiles[k].argmax())]
+    frame = None if k < len(drifts) else first.index
+    of = [view.index for view in views if view.recording == first.recording]
+    recording = None if len(of) == count else (of[0], of[-1])
     return LikelyChange(
-        float(scales[k]), float(sigmas[k]), profiles[k], found.motion[k], frame, limit
+        float(scales[k]), float(sigmas[k]), profiles[k], found.motion[k], frame, recording, limit
     )
+
+
+def _candidates(views: Sequence[SampledView]) -> tuple[Float64, Float64]:
+    """Return the profiles of drifts (D, N) and steps (S, N), each of one recording."""
+    index = np.array([view.index for view in views], float)
+    recording = np.array([view.recording for view in views])
+    drifts, steps = [np.zeros((0, len(views)))], [np.zeros((0, len(views)))]
+    for number in np.unique(recording):
+        own = recording == number
+        position = np.where(own, np.cumsum(own), 0)[None]  # 1, 2, ... in the recording
+        since = np.where(own, index - index[own][0], 0.0)
+        first_after = np.arange(_MIN_VIEWS, own.sum() - _MIN_VIEWS + 1)[:, None] + 1
+        if len(first_after):
+            drifts.append(since[None] / max(float(since.max()), 1.0))
+        steps.append((position >= first_after).astype(float))
+        if number != recording[0] and own.sum() >= _MIN_VIEWS:
+            steps.append((position >= 1).astype(float))
+    return np.concatenate(drifts), np.concatenate(steps)
 
 
 def range_change(likely: LikelyChange, aligned: RefinedViews) -> RangeChange | None:
@@ -170,4 +201,6 @@ def range_change(likely: LikelyChange, aligned: RefinedViews) -> RangeChange | N
     change = 1 / (1 + scale) - 1
     confirmed = abs(change) > significance_of(independent, tests=len(views)) * serial_sigma
     in_all_sections = abs(change) > significance_of(SECTIONS) * section_sigma
-    return RangeChange(change, sigma, likely.frame, likely.limit, confirmed, in_all_sections)
+    return RangeChange(
+        change, sigma, likely.frame, likely.limit, confirmed, in_all_sections, likely.recording
+    )

@@ -349,7 +349,8 @@ class _Joint(Refiner):
         return SpilledCoarseView(coarse.centroid, Spilled(coarse, self._store.coarse))
 
     def _sampled(self, posed: PosedView[PreparedView]) -> SampledView:
-        return SampledView.of(_surface(posed), self._options.alignment.points)
+        points = self._options.alignment.points
+        return SampledView.of(_surface(posed), points, posed.recording)
 
 
 def _mean_errors(errors: Sequence[tuple[float, float, float]]) -> list[float]:

@@ -200,12 +200,15 @@ class Component:
     result
         Its own model, where it is not part of the main one and has more than a few frames: that of
         its frames only, in its own world frame.
+    reached
+        Largest probability of a pose relative to component 0, if it did not suffice; 0 without any.
     """
 
     frames: tuple[frame_ranges.Range, ...]
     T_main_component: Float64 | None
     joined: Literal["links", "motion", "odometry"] | None
     result: Reconstruction | None = None
+    reached: float = 0.0
 
     @property
     def connected(self) -> bool:

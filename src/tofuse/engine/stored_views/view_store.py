@@ -109,6 +109,8 @@ class SampledView:
     target_scale
         By which the depth in the target image is multiplied where it is used: the images of all
         views are not in memory twice.
+    recording
+        Number of its recording, if several are joined.
     """
 
     index: int
@@ -120,9 +122,10 @@ class SampledView:
     has_albedo: bool = False
     measures_range: bool = False
     target_scale: float = 1.0
+    recording: int = 0
 
     @classmethod
-    def of(cls, surface: PreparedView, points: int) -> SampledView:
+    def of(cls, surface: PreparedView, points: int, recording: int = 0) -> SampledView:
         """Sample approximately `points` points of a view."""
         sampled = sampled_points(surface, points)
         return cls(
@@ -134,6 +137,7 @@ class SampledView:
             CoarseView.of(surface, sampled),
             surface.has_albedo,
             surface.measures_range,
+            recording=recording,
         )
 
     def with_points(self, which: Intp | slice) -> SampledView:
@@ -296,6 +300,8 @@ class PosedView(Generic[V]):
         (4, 4) pose in the frame of its component.
     spill
         Storage; in memory unless given.
+    recording
+        Number of its recording, if several are joined.
 
     Attributes
     ----------
@@ -311,8 +317,9 @@ class PosedView(Generic[V]):
         T_component_camera: Float64,
         component: int = 0,
         spill: Spill[V] | None = None,
+        recording: int = 0,
     ) -> None:
-        self.index, self.depth = view.index, view.depth
+        self.index, self.depth, self.recording = view.index, view.depth, recording
         self.T_component_camera, self.component = T_component_camera, component
         self._kept: V | Spilled[V] = view if spill is None else Spilled(view, spill)
 
@@ -340,6 +347,8 @@ class ViewStore(Generic[V]):
         In the order of their frames. The first of each component stays.
     coarse
         Storage for the coarse versions of these views.
+    recording
+        Number of the recording of the next views.
     """
 
     def __init__(
@@ -349,6 +358,7 @@ class ViewStore(Generic[V]):
         scratch: Scratch = Scratch(),  # noqa: B008 - immutable
     ) -> None:
         self.views: list[PosedView[V]] = []
+        self.recording = 0
         self.coarse: Spill[CoarseView] = scratch.part(_COARSE_FRACTION)
         self._spacing, self._always = spacing, frozenset(always)
         self._spill: Spill[V] = scratch.part(1 - _COARSE_FRACTION)
@@ -366,7 +376,8 @@ class ViewStore(Generic[V]):
     ) -> None:
         """Add the next view, after `reduced`, if it is selected."""
         if self._is_selected(view, T_component_camera, component):
-            self._add(PosedView(reduced(view), T_component_camera, component, self._spill))
+            T, spill = T_component_camera, self._spill
+            self._add(PosedView(reduced(view), T, component, spill, self.recording))
 
     def push_posed(self, posed: PosedView[V]) -> None:
         """Add the next view of another store, if it is selected."""
