@@ -106,7 +106,8 @@ class Observations:
             self.ambiguity_m = filtered.corrected.ambiguity_m
         if step.surface is not None:
             self.views.push(step.surface, T, step.component, _reduced)
-            self.newest = PosedView(step.surface, T, step.component)
+            of = self.views.recording
+            self.newest = PosedView(step.surface, T, step.component, recording=of)
         view = filtered.for_model
         if self._needs_points:
             view = as_cloud(view, _MAX_POINTS)
