@@ -450,6 +450,15 @@ def test_half_of_the_tries_are_away_from_the_links(monkeypatch) -> None:
     assert apart(tried) < 0.3
 
 
+def test_sufficient_probability_is_not_what_a_contradicted_join_lacked(monkeypatch) -> None:
+    two = [stretch(c, range(20 * c, 20 * c + 20)) for c in range(2)]
+    monkeypatch.setattr(JoinChecks, "confirming", lambda *_: [])
+    monkeypatch.setattr(JoinChecks, "contradicts", lambda *_: True)
+    monkeypatch.setattr(_Joiner, "_register", lambda _, a, b: probable(a, b, 0.7))
+    _, other = Joining(bridge=False, tries=6, min_probability=0.5).join(two, [])
+    assert other.reached == 0.0
+
+
 def test_first_group_is_main_on_request(three) -> None:
     strange = stretch(0, range(4), **STRANGE)
     groups = replace(SPARSELY, main="first").join([strange, three[1], three[2]], [])

@@ -199,7 +199,8 @@ class _Joiner:
         self._links: list[Link] = []
         self._tried: set[tuple[int, int]] = set()  # pairs of views that were registered
         self._refused: set[tuple[int, ...]] = set()
-        self._reached: dict[tuple[int, int], float] = {}  # probabilities between components
+        # Insufficient probabilities of the last joins that were tried, by pairs of components.
+        self._reached: dict[frozenset[int], float] = {}
         self._proposals: dict[tuple[int, ...], tuple[float, list[Link]]] = {}
         total = sum(len(s.frames) for s in components)
         self._searches = options.searches + len(components) + total // _FRAMES_PER_SEARCH
@@ -370,7 +371,7 @@ class _Joiner:
             else replace(
                 group,
                 reached=max(
-                    self._reached.get(pair, 0.0)
+                    self._reached.get(frozenset(pair), 0.0)
                     for pair in itertools.product(main, group.T_group_component)
                 ),
             )
@@ -428,11 +429,13 @@ class _Joiner:
         certain = any(link.certain for link in links)
         min_probability = self._options.min_probability
         probability = self._probability(a, b, [*links, *confirming]) if min_probability else None
-        for pair in itertools.chain(itertools.product(a.T, b.T), itertools.product(b.T, a.T)):
-            self._reached[pair] = max(self._reached.get(pair, 0.0), probability or 0.0)
+        is_doubtful = probability is not None and probability < min_probability
+        if probability is not None:
+            for pair in map(frozenset, itertools.product(a.T, b.T)):
+                self._reached[pair] = probability if is_doubtful else 0.0
         if (
             not (certain or len(links) + len(confirming) > 1)
-            or (probability is not None and probability < min_probability)
+            or is_doubtful
             or self._checks.contradicts(a, b, best)
             or not self._checks.reachable(a, b, T_a_b)
         ):
