@@ -40,8 +40,8 @@ _MEAN_M, _SLOPE = 0.002, 0.001
 _FIXED_M = 1e-7  # prior of curve and offsets that are fixed to 0
 _FLOOR_M = 0.001  # lower limit of the noise
 _MIN_SPREAD_M = 0.3
-# The scale of ranges is that of the clock of the light: larger errors, of a curve that passes 0 m
-# within this fraction of its values, are of the board.
+# A ToF camera's scale is that of its clock, so that it hardly errs by more than this fraction. A
+# curve with a larger slope and a constant below this fraction of its values is due to the board.
 _MAX_SCALE_ERROR, _MAX_CONSTANT = 0.01, 1 / 3
 _MAX_SHAPE_M = 0.004  # standard deviation of the curve without mean and slope
 _BLUR_WIDTH = 1 / 50  # width of the blur, relative to the image's width
@@ -162,7 +162,7 @@ def calibrate_depth(views: Sequence[PlaneView], camera: Camera, where: str = "")
         scale,
         (
             *_warnings(views, len(observed) / (shape[0] * shape[1])),
-            *_of_scale(knots, curve),
+            *_size_warnings(knots, curve),
         ),
     )
 
@@ -387,13 +387,14 @@ def _patch_rms(
     return float(np.sqrt(np.mean(np.square(medians)))) if medians else float("nan")
 
 
-def _of_scale(knots: Float64, curve: Float64) -> list[str]:
+def _size_warnings(knots: Float64, curve: Float64) -> list[str]:
+    """Warn of a curve that a wrong size of the board's squares would explain."""
     slope, constant = np.polyfit(knots, curve, 1)
     if abs(slope) < _MAX_SCALE_ERROR or abs(constant) > _MAX_CONSTANT * abs(slope) * knots.mean():
         return []
     return [
-        f"ranges are {100 * abs(slope):.1f} % too {'long' if slope > 0 else 'short'}, which those "
-        "of a ToF camera hardly are: measure a square of the board, as printers scale it"
+        f"ranges are {100 * abs(slope):.1f} % too {'long' if slope > 0 else 'short'}, more than is "
+        "usual for a ToF camera: measure a square of the board, since printers may rescale it"
     ]
 
 

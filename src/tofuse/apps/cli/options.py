@@ -199,7 +199,7 @@ class Run(JsonLines, Seed, Threads, Page, Selection):
         texture the surface in mesh.glb and in the report, from colour images or else amplitudes
         (default: if there are enough colour images)
     faces : N
-        maximum number of triangles, or a few more where so few leave no surface
+        maximum number of triangles, slightly exceeded if so few left no surface
         (default: all)
     voxel : LENGTH
         resolution of the model, e.g. 5mm (default: from the camera's resolution)
@@ -427,7 +427,7 @@ class Merge(JsonLines, Seed, Threads, Edited):
     texture
         texture the surface (default: as the first result)
     faces : N
-        maximum number of triangles, or a few more where so few leave no surface
+        maximum number of triangles, slightly exceeded if so few left no surface
         (default: as the first result)
     voxel : LENGTH
         resolution of the model, e.g. 5mm (default: as the first result)

@@ -279,15 +279,15 @@ def fpfh(
     surroundings
         Points and normals (m, 3) that are the neighbours; the points themselves unless given.
     """
-    n = len(points)
+    n, offset = len(points), 0
     tree = KdTree(points if surroundings is None else surroundings[0])
     if surroundings is not None:
         points, normals = (
             np.vstack(both) for both in zip((points, normals), surroundings, strict=True)
         )
+        offset = n
     first, neighbours, distances = tree.within(points, reach)
-    if surroundings is not None:
-        neighbours += n
+    neighbours += offset
     spfh, neighbour_mean = np.empty((len(points), 3, _BINS)), np.empty((n, 3 * _BINS))
     run_chunks(
         lambda a, b: kernels.histograms(

@@ -28,7 +28,7 @@ class Fusion(Bounded):
         same result. A tenth as much may be used for stored views; those that do not fit are on
         disk until they are fused.
     faces
-        Maximum number of triangles, or a few more where so few leave no surface; 0 keeps all. The
+        Maximum number of triangles, slightly exceeded if so few left no surface; 0 keeps all. The
         cloud keeps all points.
     texture
         Maximum edge of the texture of the surface, in texels: 64 to 8192, or 0 for none.
