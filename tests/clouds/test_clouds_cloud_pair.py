@@ -245,6 +245,17 @@ def test_agreement_is_symmetric(scans):
     assert there.support == pytest.approx(back.support, abs=1e-9)
 
 
+@pytest.mark.parametrize("noise", [0.001, 0.005, 0.01, 0.02])
+def test_sigma_of_a_map_is_the_distance_of_its_points_from_their_plane(noise):
+    """Also of a sheet thicker than a cell, of which the neighbourhoods are narrower."""
+    rng = np.random.default_rng(0)
+    sheet = rng.uniform(-1, 1, (20_000, 3)) * [1, 1, 0] + noise * rng.normal(size=(20_000, 3))
+    view = CloudFrame.of(sheet + np.array([0, 0, 3]))
+    found = CloudMap.of(averaged(view, 0.05), 0.05, view)
+    spread = float(found.view.points[:, 2].std())
+    assert 0.7 * spread < found.sigma < spread
+
+
 def test_evidence_of_clouds_is_lead_in_distinct_surfaces():
     """Whatever fraction of the points walls cover, a room with the same walls is not believed."""
 

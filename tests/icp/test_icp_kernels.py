@@ -41,7 +41,7 @@ def shapes(points, k, origin=(0.0, 0.0, 0.0)):
     points = np.asarray(points, float)
     index, _ = KdTree(points).neighbours(points, k)
     n = len(points)
-    out = np.empty((n, 3)), np.empty(n), np.empty(n)
+    out = np.empty((n, 3)), np.empty(n), np.empty((n, 2))
     local_shapes(points, index, points, np.array(origin), *out)
     return index, out
 
@@ -49,23 +49,23 @@ def shapes(points, k, origin=(0.0, 0.0, 0.0)):
 def test_normals_are_plane_fits_facing_origin():
     r = np.random.default_rng(0)
     points = r.normal(size=(300, 3)) * [1, 1, 0.1] + np.array([0, 0, 3])
-    index, (normals, _, roughness) = shapes(points, 10)
+    index, (normals, _, extents) = shapes(points, 10)
     for i in range(300):
         near = points[index[i]]
         values, vectors = np.linalg.eigh(np.cov(near.T, bias=True))
         n = vectors[:, 0] * np.sign(-vectors[:, 0] @ points[i])
         np.testing.assert_allclose(normals[i], n, atol=1e-9)
-        np.testing.assert_allclose(roughness[i], np.sqrt(values[0] / values[1]), atol=1e-9)
+        np.testing.assert_allclose(extents[i], np.sqrt(values[:2]), atol=1e-9)
 
 
 def test_sheet_border_has_wide_angular_gap():
     x, y = np.meshgrid(np.arange(20.0), np.arange(20.0))
     sheet = np.column_stack([x.ravel(), y.ravel(), np.full(400, 9.0)])
-    _, (_, gap, roughness) = shapes(sheet, 9)
+    _, (_, gap, extents) = shapes(sheet, 9)
     edge = (x == 0) | (x == 19) | (y == 0) | (y == 19)
     assert np.rad2deg(gap[~edge.ravel()]).max() < 91
     assert np.rad2deg(gap[edge.ravel()]).min() > 135
-    assert roughness.max() < 1e-6
+    assert extents[:, 0].max() < 1e-6
 
 
 def test_collinear_points_have_no_normal():

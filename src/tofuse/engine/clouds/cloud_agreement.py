@@ -1,6 +1,6 @@
 """Agreement of two clouds at a pose: coincident surfaces and free-space violations.
 
-As `agreement`, for views without a camera. The distance tolerance follows from the roughness of
+As `agreement`, for views without a camera. The distance tolerance follows from the thickness of
 the surfaces at the resolution of the comparison. Free space is known only for views with a known
 viewpoint.
 """
@@ -99,8 +99,8 @@ class CloudMap:
     def of(cls, view: CloudFrame, size: float, full_view: Frame) -> CloudMap:
         """Prepare a view that was averaged from `full_view`."""
         shape = surface_shape.shape_at(view, np.arange(len(view)), NEIGHBOURS)
-        roughness = shape.roughness[np.isfinite(shape.roughness)]
-        sigma = float(np.median(roughness)) * size if len(roughness) else size
+        thickness = shape.thickness[np.isfinite(shape.thickness)]
+        sigma = float(np.median(thickness)) if len(thickness) else size
         viewpoint = free_space_viewpoint(full_view)
         sphere = None if viewpoint is None else RangeSphere.of(full_view, viewpoint)
         tested = (

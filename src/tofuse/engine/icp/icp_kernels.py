@@ -361,14 +361,14 @@ def local_shapes(
     origin: Float64,
     normals: Float64,
     gap: Float64,
-    roughness: Float64,
+    extents: Float64,
 ) -> None:
     """Fit the surface around each of the `centres` (m, 3) to its neighbours ``points[index[i]]``.
 
     `index` (m, k) is -1 after the last neighbour. Writes unit normals (m, 3) towards `origin` (3,),
     NaN where the neighbours lie on a line; the widest angle `gap` (m,) in rad around the centre
-    without a neighbour; and the ratio (m,) of the neighbours' rms extents across the plane and
-    along its shorter side.
+    without a neighbour; and the neighbours' rms extents (m, 2) across the plane and along its
+    shorter side.
     """
     mean = np.empty(3)
     C = np.empty((3, 3))
@@ -380,9 +380,10 @@ def local_shapes(
         if count < 3 or not values[1] > _LINE_RATIO * values[2]:
             normals[i, :] = np.nan
             gap[i] = 2 * math.pi
-            roughness[i] = np.nan
+            extents[i, :] = np.nan
             continue
-        roughness[i] = math.sqrt(max(values[0], 0.0) / values[1])
+        extents[i, 0] = math.sqrt(max(values[0], 0.0))
+        extents[i, 1] = math.sqrt(values[1])
         facing = 0.0
         for a in range(3):
             facing += vectors[a, 0] * (origin[a] - centres[i, a])

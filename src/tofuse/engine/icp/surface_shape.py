@@ -35,18 +35,23 @@ class Shape:
         (n, 3) unit normals of fitted planes, towards the sensor; NaN where points lie on a line.
     boundary
         (n,) True where the surface ends: an empty angle of 135 degrees or more round the point.
+    thickness
+        (n,) rms distance of the neighbours from the plane, m; NaN where points lie on a line.
     roughness
-        (n,) extent of the neighbours across the plane, relative to that along it: 0 on a plane,
-        near 1 where the noise is as wide as the neighbourhood; NaN where points lie on a line.
+        (n,) the same relative to their extent along the plane: 0 on a plane, near 1 where the noise
+        is as wide as the neighbourhood.
     """
 
     normals: Float64
     boundary: Bool
+    thickness: Float64
     roughness: Float64
 
     def at(self, index: Int64) -> Shape:
         """Return the shape at a subset of the points."""
-        return Shape(self.normals[index], self.boundary[index], self.roughness[index])
+        return Shape(
+            self.normals[index], self.boundary[index], self.thickness[index], self.roughness[index]
+        )
 
 
 @dataclass(eq=False)
@@ -96,7 +101,7 @@ def _fit(view: Frame, tree: KdTree, index: Int64, neighbours: int) -> Shape:
     neighbour_index, _ = tree.neighbours(centres, neighbours)
     n = len(index)
     normals = np.empty((n, 3))
-    gap, roughness = np.empty(n), np.empty(n)
+    gap, extents = np.empty(n), np.empty((n, 2))
     origin = np.asarray(view.origin, np.float64)
 
     def work(a: int, b: int) -> None:
@@ -107,8 +112,9 @@ def _fit(view: Frame, tree: KdTree, index: Int64, neighbours: int) -> Shape:
             origin,
             normals[a:b],
             gap[a:b],
-            roughness[a:b],
+            extents[a:b],
         )
 
     run_chunks(work, n)
-    return Shape(normals, gap >= _BOUNDARY_GAP, roughness)
+    across, along = extents.T
+    return Shape(normals, gap >= _BOUNDARY_GAP, across, across / along)
