@@ -246,6 +246,17 @@ def test_views_without_colour_do_not_darken() -> None:
     assert (mesh.views == 4).all()
 
 
+def test_views_without_colour_do_not_count_in_the_mean() -> None:
+    """Beside the field of view of the colour camera most views see a surface without colour."""
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    colors = [
+        None if c is None else np.full((72, 88, 3), c, np.uint8) for c in (*[None] * 5, 100, 200)
+    ]
+    views = [RangeView.of(frame_of(ranges, k, color_image=c)) for k, c in enumerate(colors)]
+    mesh = fuse_surface(views, np.stack([EYE] * len(views)), Fusion(voxel_m=0.03))
+    np.testing.assert_array_equal(np.unique(mesh.color, axis=0), [[150, 150, 150]])
+
+
 @pytest.mark.parametrize("scale", [1, 8])  # from 4 on, images are stored at half resolution
 @pytest.mark.parametrize("channel", ["color_image", "amplitude_image"])
 def test_surfaces_do_not_darken_where_known_colours_end(scale: int, channel: str) -> None:
