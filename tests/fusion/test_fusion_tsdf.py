@@ -349,11 +349,17 @@ def test_builder_keeps_views_within_memory_limit() -> None:
 def test_camera_errors_are_corrected_in_images_as_in_points() -> None:
     frame = frame_of(np.random.default_rng(5).uniform(1, 3, (72, 88)))
     errors = {"offset": 0.03, "scale": -0.01, "focal": 0.02}
-    view = RangeView.of(frame)
     correction = CameraCorrection(errors)
+    view = RangeView.of(replace(frame, depth_kind="z"))
     found = [correction(view), correction(view)]
     expected = without_errors(view.as_cloud().points, errors)
     np.testing.assert_allclose(found[1].as_cloud().points, expected, atol=2e-3)
+    # Where the range is measured, it is what a wrong focal length leaves alone.
+    measured = RangeView.of(frame)
+    before, after = (
+        np.linalg.norm(v.as_cloud().points, axis=1) for v in (measured, correction(measured))
+    )
+    np.testing.assert_allclose(after, 0.99 * before + 0.03, atol=2e-4)
     assert found[0].projection is found[1].projection
     # Points still project onto the pixels that measured them.
     p = found[0].projection
