@@ -13,6 +13,7 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.spill import Spill
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
 from tofuse.engine.fusion.block_kernels import block_of, voxel_of
+from tofuse.engine.fusion.cloud import has_color
 from tofuse.engine.fusion.layout import Layout
 from tofuse.engine.fusion.model import ModelBuilder
 from tofuse.engine.fusion.options import Fusion
@@ -244,6 +245,21 @@ def test_views_without_colour_do_not_darken() -> None:
     mesh = fuse_surface(views, np.stack([EYE] * 4), Fusion(voxel_m=0.03))
     np.testing.assert_array_equal(np.unique(mesh.color, axis=0), [[200, 0, 0]])
     assert (mesh.views == 4).all()
+
+
+def test_dark_surfaces_have_a_colour_and_unknown_ones_take_no_contrast() -> None:
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    albedo = np.tile(np.linspace(50, 1000, 88), (72, 1))
+    partly = np.where(np.arange(72)[:, None] < 60, albedo, 0)
+    shades = []
+    for light, share in ((albedo, 1.0), (partly, 60 / 72)):
+        frame = frame_of(ranges, amplitude_image=(light / ranges**2).astype(np.float32))
+        mesh = fuse_surface([RangeView.of(frame)], EYE[None], Fusion(voxel_m=0.03))
+        known = has_color(mesh.color)
+        assert known.mean() == pytest.approx(share, abs=0.04 * (share < 1))
+        shades.append(np.quantile(mesh.color[known], (0.02, 0.5, 0.98)))
+    np.testing.assert_allclose(*shades, atol=8)
+    assert shades[0][0] < 40
 
 
 def test_views_without_colour_do_not_count_in_the_mean() -> None:

@@ -214,11 +214,19 @@ def _rows(piece: Piece, ids: Int64) -> Int32:
 
 
 def to_rgb(intensity: Float32) -> UInt8 | None:
-    """Return RGB (N, 3) of intensity (N, C): three channels are RGB, one the root of the albedo."""
+    """Return RGB (N, 3) of intensity (N, C): three channels are RGB, one the root of the albedo.
+
+    Black where it is 0, which is unknown.
+    """
     channels = intensity.shape[1]
     if channels == 3:
         return np.round(intensity).clip(0, 255).astype(np.uint8)
-    return grey_of(intensity[:, 0].astype(float) ** 2) if channels else None
+    if not channels:
+        return None
+    known = intensity[:, 0] > 0
+    color = np.zeros((len(intensity), 3), np.uint8)
+    color[known] = grey_of(intensity[known, 0].astype(float) ** 2)
+    return color
 
 
 _CHUNKS = 16
