@@ -13,6 +13,7 @@ from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.compute.spill import Spill
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
 from tofuse.engine.fusion.block_kernels import block_of, voxel_of
+from tofuse.engine.fusion.cloud import has_color
 from tofuse.engine.fusion.layout import Layout
 from tofuse.engine.fusion.model import ModelBuilder
 from tofuse.engine.fusion.options import Fusion
@@ -246,6 +247,32 @@ def test_views_without_colour_do_not_darken() -> None:
     assert (mesh.views == 4).all()
 
 
+def test_dark_surfaces_have_a_colour_and_unknown_ones_take_no_contrast() -> None:
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    albedo = np.tile(np.linspace(50, 1000, 88), (72, 1))
+    partly = np.where(np.arange(72)[:, None] < 60, albedo, 0)
+    shades = []
+    for light, share in ((albedo, 1.0), (partly, 60 / 72)):
+        frame = frame_of(ranges, amplitude_image=(light / ranges**2).astype(np.float32))
+        mesh = fuse_surface([RangeView.of(frame)], EYE[None], Fusion(voxel_m=0.03))
+        known = has_color(mesh.color)
+        assert known.mean() == pytest.approx(share, abs=0.04 * (share < 1))
+        shades.append(np.quantile(mesh.color[known], (0.02, 0.5, 0.98)))
+    np.testing.assert_allclose(*shades, atol=8)
+    assert shades[0][0] < 40
+
+
+def test_views_without_colour_do_not_count_in_the_mean() -> None:
+    """Beside the field of view of the colour camera most views see a surface without colour."""
+    ranges = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+    colors = [
+        None if c is None else np.full((72, 88, 3), c, np.uint8) for c in (*[None] * 5, 100, 200)
+    ]
+    views = [RangeView.of(frame_of(ranges, k, color_image=c)) for k, c in enumerate(colors)]
+    mesh = fuse_surface(views, np.stack([EYE] * len(views)), Fusion(voxel_m=0.03))
+    np.testing.assert_array_equal(np.unique(mesh.color, axis=0), [[150, 150, 150]])
+
+
 @pytest.mark.parametrize("scale", [1, 8])  # from 4 on, images are stored at half resolution
 @pytest.mark.parametrize("channel", ["color_image", "amplitude_image"])
 def test_surfaces_do_not_darken_where_known_colours_end(scale: int, channel: str) -> None:
@@ -338,11 +365,17 @@ def test_builder_keeps_views_within_memory_limit() -> None:
 def test_camera_errors_are_corrected_in_images_as_in_points() -> None:
     frame = frame_of(np.random.default_rng(5).uniform(1, 3, (72, 88)))
     errors = {"offset": 0.03, "scale": -0.01, "focal": 0.02}
-    view = RangeView.of(frame)
     correction = CameraCorrection(errors)
+    view = RangeView.of(replace(frame, depth_kind="z"))
     found = [correction(view), correction(view)]
     expected = without_errors(view.as_cloud().points, errors)
     np.testing.assert_allclose(found[1].as_cloud().points, expected, atol=2e-3)
+    # Where the range is measured, it is what a wrong focal length leaves alone.
+    measured = RangeView.of(frame)
+    before, after = (
+        np.linalg.norm(v.as_cloud().points, axis=1) for v in (measured, correction(measured))
+    )
+    np.testing.assert_allclose(after, 0.99 * before + 0.03, atol=2e-4)
     assert found[0].projection is found[1].projection
     # Points still project onto the pixels that measured them.
     p = found[0].projection

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph.graph import Measured, Optimisation, PoseGraph, build_graph
+from tofuse.engine.graph.graph import Gravity, Measured, Optimisation, PoseGraph, build_graph
 from tofuse.engine.graph.graph_covariances import (
     MIN_WEIGHT,
     Branches,
@@ -65,6 +65,10 @@ def test_loop_errors_are_chi_square_distributed(drawn) -> None:
     bent = graph.measurements.copy()
     bent[graph.loop] = bent[graph.loop] @ se3.exp(np.array([0.1, 0, 0, 0, 0, 0]))
     assert (loop_errors(replace(graph, measurements=bent), graph.poses) > 30).all()
+    # Gravity is not odometry.
+    down = np.swapaxes(graph.poses[:, :3, :3], 1, 2) @ [0, 0, 1]
+    gravity = Gravity(np.arange(N), down, np.full(N, 0.01))
+    np.testing.assert_array_equal(loop_errors(replace(graph, gravity=gravity), graph.poses), d[0])
 
 
 def test_loops_between_parts_without_odometry_have_no_error() -> None:

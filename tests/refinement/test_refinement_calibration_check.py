@@ -137,6 +137,15 @@ def test_error_of_a_part_of_the_images_is_worth_less():
     assert in_part / large < 0.5 * everywhere / small
 
 
+def test_sections_of_the_images_have_exposures_of_their_own() -> None:
+    views, refined = kept(0.0)
+    linearised = Linearised.of(views, refined.poses, refined.pairs, OPTIONS, Priors.none())
+    before = linearised.state.exposure.copy()
+    first, second = (linearised.shared_errors([kernels.OFFSET]) for _ in range(2))
+    np.testing.assert_array_equal(linearised.state.exposure, before)
+    assert first.dispersion == second.dispersion
+
+
 def test_errors_that_resemble_each_other_are_told_apart_together():
     """Rays 1 % too narrow and ranges 3 cm short."""
     narrow = replace(CAMERA, fx=1.01 * CAMERA.fx, fy=1.01 * CAMERA.fy)

@@ -67,6 +67,14 @@ def test_fractions_are_estimated_from_moving_light() -> None:
     assert fractions == pytest.approx((0.012, 0.02), rel=0.1)
 
 
+def test_a_fraction_that_would_be_negative_leaves_the_others_the_best() -> None:
+    """They are those of an estimate without it."""
+    light = frames((-0.003, 0.02), 0.5)
+    narrow, wide = estimate_fractions(light, SOURCE, STILL, WIDTHS)
+    assert narrow == 0
+    assert wide == pytest.approx(estimate_fractions(light, SOURCE, STILL, WIDTHS[1:])[0], rel=1e-6)
+
+
 def test_exposure_and_temperature_are_not_scattering() -> None:
     light = frames((0.012, 0.02), 0.5)
     rng = np.random.default_rng(8)

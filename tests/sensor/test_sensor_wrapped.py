@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.frames.frames import RangeFrame
+from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, RangeFrame
 from tofuse.engine.sensor.wrapped import Wrapped
 
 PERIOD = 5.0
@@ -44,6 +46,18 @@ def test_wrapped_pixels_are_removed() -> None:
     assert (radial > PERIOD).mean() > 0.2
     assert not keep[radial > PERIOD + 0.05].any()
     assert keep[radial < PERIOD - 0.05].mean() > 0.999
+
+
+@pytest.mark.parametrize("amplitude", [0.0, SATURATED_AMPLITUDE])
+def test_pixels_without_an_amplitude_are_not_dark(amplitude: float) -> None:
+    """Next to wrapped ones, a sign or a lamp that saturates, and pixels of unknown amplitude."""
+    radial = corridor(6.2)
+    frame = image(radial, 0.5)
+    light = frame.amplitude_image.copy()
+    light[130:140, 60:90] = amplitude
+    keep = Wrapped().mask(replace(frame, amplitude_image=light), ())
+    assert not keep[radial > PERIOD + 0.05].any()
+    assert keep[130:140, 60:90].all()
 
 
 @pytest.mark.parametrize("albedo", [0.04, 0.08])

@@ -32,8 +32,9 @@ class Blocks(NamedTuple):
         (B, VOXELS) mean distance in m, and sum of the weights in 1/m^2.
     view_count
         (B, VOXELS) number of views whose surface is within the truncation distance.
-    color
-        (B, VOXELS, C) mean colour or amplitude over those views; C may be 0.
+    color, color_count
+        (B, VOXELS, C) mean colour or amplitude over those of these views that have one, and (B,
+        VOXELS) their number; C may be 0, and then there is no number.
     free_weight
         (B, 8) weight of free-space observations of whole octants, not yet in `distance`.
     """
@@ -44,6 +45,7 @@ class Blocks(NamedTuple):
     weight: Float32
     view_count: UInt16
     color: Float32
+    color_count: UInt16
     free_weight: Float32
 
 

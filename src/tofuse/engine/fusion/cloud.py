@@ -225,13 +225,13 @@ def _colors(sums: Float64) -> UInt8 | None:
 
 
 def grey_of(albedo: Float64) -> UInt8:
-    """Return grey colours (N, 3) of albedos (N,) in any unit."""
+    """Return grey colours (N, 3) of albedos (N,) in any unit; none is black, which is no colour."""
     if len(albedo) == 0:
         return np.zeros((0, 3), np.uint8)
     low, high = np.percentile(albedo, [1, 99])
     # Gamma 1/2.2: albedo is linear, screens are not.
     grey = ((albedo - low) / max(high - low, 1e-12)).clip(0, 1) ** (1 / 2.2)
-    return np.repeat(np.round(255 * grey).astype(np.uint8)[:, None], 3, axis=1)
+    return np.repeat(np.maximum(np.round(255 * grey), 1).astype(np.uint8)[:, None], 3, axis=1)
 
 
 def _estimate_normals(points: Float64, to_camera: Float64, neighbours: int) -> Float32 | None:

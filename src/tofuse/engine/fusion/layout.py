@@ -218,7 +218,8 @@ class Layout:
     @property
     def block_bytes(self) -> int:
         """Memory of a block while it is fused."""
-        return VOXELS * (_VOXEL_BYTES + 4 * self.channels) + _BLOCK_BYTES
+        of_color = 4 * self.channels + 2 * (self.channels > 0)
+        return VOXELS * (_VOXEL_BYTES + of_color) + _BLOCK_BYTES
 
     def single_region(self) -> Region:
         """All blocks as a single region."""

@@ -62,6 +62,8 @@ class RangeView:
         RGB; None if neither is known.
     sigma_m
         Typical standard deviation of z.
+    measures_range
+        Whether its camera measures radial range, not z.
     """
 
     index: int
@@ -73,6 +75,7 @@ class RangeView:
     strength: UInt8
     intensity: NDArray[np.float16] | UInt8 | None
     sigma_m: float
+    measures_range: bool = False
 
     @classmethod
     def of(
@@ -136,6 +139,7 @@ class RangeView:
             _weight_codes(weight),
             _intensity(frame, shape),
             _typical_sigma(variance, usable),
+            frame.depth_kind == "range",
         )
 
     @property
@@ -251,10 +255,13 @@ class CameraCorrection:
         z = z * np.float32(1 + errors.get("scale", 0.0)) + np.where(
             z > 0, np.float32(errors.get("offset", 0.0)) / np.sqrt(projection.lengths2), 0
         )
+        corrected = self._corrected(projection)
+        if view.measures_range:  # along another ray
+            z *= np.sqrt(projection.lengths2 / corrected.lengths2)
         z = np.maximum(np.nan_to_num(z), 0)
         unit = max(float(z.max(initial=0.0)), 1e-3) / 65535
         counts = np.round(z / unit).astype(np.uint16)
-        return replace(view, z=counts, unit=unit, projection=self._corrected(projection))
+        return replace(view, z=counts, unit=unit, projection=corrected)
 
     def _corrected(self, projection: Projection) -> Projection:
         focal_factor = 1 + self._errors.get("focal", 0.0)

@@ -132,7 +132,7 @@ def make_vertices(
 ) -> None:
     """Write the vertices of the marked cells of blocks start..stop, from row starts[b] on."""
     keys, distance, weight = blocks.keys, blocks.distance, blocks.weight
-    view_count, color = blocks.view_count, blocks.color
+    view_count, color, color_count = blocks.view_count, blocks.color, blocks.color_count
     points, normals, colors, sigmas, views = vertices
     d = np.empty((2, 2, 2))
     channels = color.shape[2]
@@ -148,7 +148,7 @@ def make_vertices(
                 continue
             i, j, k = voxel_of(v)
             color_sum[:] = 0
-            view_sum = 0.0
+            color_views = 0.0
             total = 0.0
             max_views = 0
             for q in range(8):
@@ -157,12 +157,10 @@ def make_vertices(
                 d[q >> 2, (q >> 1) & 1, q & 1] = distance[m, w]
                 total += weight[m, w]
                 max_views = max(max_views, view_count[m, w])
-                has_color = False
+                if channels > 0:
+                    color_views += color_count[m, w]
                 for s in range(channels):
-                    has_color = has_color or color[m, w, s] > 0
-                    color_sum[s] += view_count[m, w] * color[m, w, s]
-                if has_color:
-                    view_sum += view_count[m, w]
+                    color_sum[s] += color_count[m, w] * color[m, w, s]
             crossing_sum[:] = 0
             g[:] = 0
             crossings = 0
@@ -188,7 +186,7 @@ def make_vertices(
                 # A gradient of 0 has no direction; any unit vector will do.
                 normals[row, axis] = g[axis] / length if length > 0 else np.float64(axis == 2)
             for s in range(channels):
-                colors[row, s] = color_sum[s] / max(view_sum, 1.0)
+                colors[row, s] = color_sum[s] / max(color_views, 1.0)
             sigmas[row] = 1 / np.sqrt(total / 8)
             views[row] = max_views
             row += 1

@@ -214,11 +214,19 @@ def _rows(piece: Piece, ids: Int64) -> Int32:
 
 
 def to_rgb(intensity: Float32) -> UInt8 | None:
-    """Return RGB (N, 3) of intensity (N, C): three channels are RGB, one the root of the albedo."""
+    """Return RGB (N, 3) of intensity (N, C): three channels are RGB, one the root of the albedo.
+
+    Black where it is 0, which is unknown.
+    """
     channels = intensity.shape[1]
     if channels == 3:
         return np.round(intensity).clip(0, 255).astype(np.uint8)
-    return grey_of(intensity[:, 0].astype(float) ** 2) if channels else None
+    if not channels:
+        return None
+    known = intensity[:, 0] > 0
+    color = np.zeros((len(intensity), 3), np.uint8)
+    color[known] = grey_of(intensity[known, 0].astype(float) ** 2)
+    return color
 
 
 _CHUNKS = 16
@@ -280,7 +288,7 @@ class Volume:
         (B,) of the blocks: those the region owns, ascending, then the layer around them.
     numbers, owned
         (B,) their numbers among all blocks, and how many of them the region owns.
-    distance, weight, seen, color, free
+    distance, weight, seen, color, color_seen, free
         See `tofuse.engine.fusion.block_kernels.Blocks`.
     free_space_stride, added
         Stride of views for free space far from surfaces, and the number of views added.
@@ -296,6 +304,7 @@ class Volume:
     weight: Float32
     seen: UInt16
     color: Float32
+    color_seen: UInt16
     free: Float32
     free_space_stride: int = 1
     added: int = 0
@@ -304,8 +313,9 @@ class Volume:
     def blocks(self) -> Blocks:
         """The blocks in the format of the kernels."""
         return Blocks(
-            self.keys, self.numbers, self.distance, self.weight, self.seen, self.color, self.free
-        )
+            self.keys, self.numbers, self.distance, self.weight, self.seen, self.color,
+            self.color_seen, self.free,
+        )  # fmt: skip
 
     @cached_property
     def index(self) -> tuple[Int64, Int32]:
@@ -327,6 +337,7 @@ class Volume:
             np.zeros((blocks, VOXELS), np.float32),
             np.zeros((blocks, VOXELS), np.uint16),
             np.zeros((blocks, VOXELS, layout.channels), np.float32),
+            np.zeros((blocks, VOXELS if layout.channels else 0), np.uint16),
             np.zeros((blocks, 8), np.float32),
             layout.free_space_stride,
         )

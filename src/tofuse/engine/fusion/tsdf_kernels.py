@@ -538,7 +538,7 @@ def integrate(
     period
         Period of the round-robin integration of free space.
     """
-    keys, numbers, distance, weight, view_count, color, free_weight = blocks
+    keys, numbers, distance, weight, view_count, color, color_count, free_weight = blocks
     views, T_camera_world, heights, codes, intensity, cells, coarse = batch
     (rows, columns), lookup, lookup_frame, nodes = camera
     weights, rear_limits, reach = decoding
@@ -644,7 +644,7 @@ def integrate(
                 _count_views(d, reach, view_count[b, voxels])
                 if intensity.shape[2]:
                     _update_colors(
-                        pixels, d, reach, intensity[s], view_count[b, voxels], color[b, voxels]
+                        pixels, d, reach, intensity[s], color_count[b, voxels], color[b, voxels]
                     )
 
 
@@ -725,24 +725,23 @@ def _update_colors(
     distance: Float32,
     limit: float,
     intensity: Float32,
-    view_count: UInt16,
+    color_count: UInt16,
     color: Float32,
 ) -> None:
     """Update the mean colour of the voxels whose surface is within `limit`.
 
     Black means that there is no colour, and is not averaged.
     """
-    truncation = np.float32(limit)
+    truncation, max_views = np.float32(limit), np.uint16(MAX_VIEWS)
     for q in range(64):
         if not distance[q] < truncation:
             continue
         has_color = False
-        had_color = False
         for n in range(intensity.shape[1]):
             has_color = has_color or intensity[pixels[q], n] > 0
-            had_color = had_color or color[q, n] > 0
         if has_color:
-            inv_count = np.float32(1) / np.float32(view_count[q]) if had_color else np.float32(1)
+            color_count[q] += np.uint16(color_count[q] < max_views)
+            inv_count = np.float32(1) / np.float32(color_count[q])
             for n in range(intensity.shape[1]):
                 color[q, n] += (intensity[pixels[q], n] - color[q, n]) * inv_count
 

@@ -248,7 +248,7 @@ def loop_errors(graph: PoseGraph, sequential: Float64) -> Float64:
     loops = edges[graph.loop[edges]]
     i, j = graph.edges[loops].T
     connected = part[i] == part[j]
-    reduced = graph.subgraph(core, edges)
+    reduced = replace(graph.subgraph(core, edges), gravity=None)
     factor = _problem(reduced, fixed[core]).factor(
         sequential[core], np.where(reduced.loop, 0.0, 1.0)
     )

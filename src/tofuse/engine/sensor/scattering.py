@@ -163,7 +163,11 @@ def estimate_fractions(
     if not np.diag(H).all():
         return zero
     scale = 1 / np.sqrt(np.diag(H))
-    fractions = scipy.optimize.nnls(H * np.outer(scale, scale), g * scale)[0] * scale
+    # Of a root of H: where a fraction is 0, the others of the normal equations are not the best.
+    value, vector = np.linalg.eigh(H * np.outer(scale, scale))
+    root = np.sqrt(np.maximum(value, 1e-12 * value[-1]))
+    projected = vector.T @ (g * scale)
+    fractions = scipy.optimize.nnls(root[:, None] * vector.T, projected / root)[0] * scale
     explained = float(2 * (fractions * g).sum() - fractions @ H @ fractions)
     noise = float(np.einsum("n,n->", b, b)) - explained
     if not explained * len(b) > _MIN_CHI2 * noise or fractions.sum() > _MAX_FRACTION:

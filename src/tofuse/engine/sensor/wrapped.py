@@ -55,9 +55,11 @@ class Wrapped(Bounded, Filter):
         step = max(1, round(np.sqrt(radial.size / _SAMPLED_PIXELS)))
         sampled, sampled_amplitude = radial[::step, ::step], amplitude[::step, ::step]
         white = white_amplitude(sampled_amplitude, sampled, sampled > 0)
+        # Amplitude is 0 where it is unknown or saturated.
         valid = (sampled > 0) & (sampled_amplitude > 0)
         dark = valid & (sampled_amplitude * np.square(sampled) < self.min_albedo * white)
         if dark.sum() <= _MIN_DARK * valid.sum():
             return keep
         periods = count_periods(radial, amplitude, period, white, pixel_pitch(frame), _OPTIONS)
-        return (periods == 0) & (amplitude * np.square(radial) >= self.min_albedo * white)
+        is_dark = (amplitude > 0) & (amplitude * np.square(radial) < self.min_albedo * white)
+        return (periods == 0) & ~is_dark

@@ -168,7 +168,8 @@ class DirectedPairs:
     def with_points(self, which: Sequence[Intp]) -> DirectedPairs:
         """Return the pairs with a part of the points of each view, yet to be evaluated."""
         views = [view.with_points(kept) for view, kept in zip(self.views, which, strict=True)]
-        return replace(self, views=views, sources=_sources(views, by_patch=False))
+        own = self.subset(np.arange(len(self.target)))  # with exposures and scales of its own
+        return replace(own, views=views, sources=_sources(views, by_patch=False))
 
     def put(self, which: Intp, subset: DirectedPairs) -> None:
         """Copy the exposure and scales of a subset into these pairs."""
