@@ -448,6 +448,12 @@ def test_half_of_the_tries_are_away_from_the_links(monkeypatch) -> None:
 
     assert apart(tried[:3]) > 0.4
     assert apart(tried) < 0.3
+    # Links that tracking found count as well.
+    first = tried[0]
+    a, b = (next(v for s in two for v in s.views if v.index == k) for k in first)
+    tried.clear()
+    joining.join(two, [probable(a, b, 0.7)])
+    assert apart([first, *tried[:3]]) > 0.4
 
 
 def test_sufficient_probability_is_not_what_a_contradicted_join_lacked(monkeypatch) -> None:

@@ -282,7 +282,17 @@ class _Joiner:
             near = change < _APART * verification.MAX_OVERLAP_DISTANCE
             return np.asarray(near & (component == component[row]))
 
+        rows = {view.index: row for row, view in enumerate(views)}
+
+        def beside(first: int, second: int) -> Bool:
+            """(K,) whether pairs of views are near another pair."""
+            a, b = around(rows[first]), around(rows[second])
+            return np.asarray((a[i] & b[j]) | (a[j] & b[i]))
+
         near_link = np.zeros(len(i), bool)
+        for known in self._links if self._options.min_probability else ():
+            if {known.i, known.j} <= rows.keys():
+                near_link |= beside(known.i, known.j)
         tries, tried = self._options.tries, Counter[tuple[int, int]]()
         rounds = [(tries, False)]
         if self._options.min_probability:
@@ -304,7 +314,7 @@ class _Joiner:
             self._tried.add(pair)
             link = self._register(first, second)
             if link is not None:
-                near_link |= around(i[k])[i] & around(j[k])[j]
+                near_link |= beside(*pair)
                 self.add(link)
                 self.decide()
 
