@@ -144,6 +144,19 @@ def test_saved_result_round_trips(result, tmp_path):
     assert again.accuracy == result.accuracy
 
 
+def test_report_names_all_recordings_that_are_joined(result, arrays, tmp_path):
+    paths = [tmp_path / name for name in ("hall", "stairs")]
+    for path, half in zip(paths, (arrays[0][:3], arrays[0][3:]), strict=True):
+        convert(tofuse.from_arrays(half, arrays[1]), path)
+    opening = {"opening": {"paths": [str(path) for path in paths]}}
+    joined = replace(result, source=tofuse.open(*paths), recording={**result.recording, **opening})
+    joined.save(tmp_path / "out")
+    replace(joined, source=None).save(tmp_path / "again")
+    for name in ("out", "again"):
+        report = (tmp_path / name / "report.html").read_text()
+        assert "<title>hall, stairs – tofuse report</title>" in report
+
+
 def test_save_rejects_foreign_folder(result, tmp_path):
     (tmp_path / "diary.txt").write_text("dear")
     with pytest.raises(tofuse.OutputError, match="no earlier result"):
