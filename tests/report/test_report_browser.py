@@ -184,6 +184,14 @@ def test_filled_holes_are_not_measured(browser, tmp_path):
             seen.check()
 
 
+def test_page_without_scripts_folds_nothing_empty(browser, report):
+    options = {"viewport": PHONE, "java_script_enabled": False}
+    with watched(browser, report.as_uri(), ours=report.as_uri(), **options) as seen:
+        assert seen.page.get_by_text("A static image").is_visible()
+        assert not seen.page.get_by_text("Colours, cameras and views").is_visible()
+        seen.check()
+
+
 def test_phone_scrolls_past_model(browser, report):
     with opened(browser, report, viewport=PHONE, has_touch=True, is_mobile=True) as seen:
         page = seen.page
