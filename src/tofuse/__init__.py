@@ -51,4 +51,13 @@ if TYPE_CHECKING:
     )
     from tofuse.formats.recordings.open import open_recording as open  # noqa: A004
 
-__getattr__, __dir__, __all__ = face(__name__, __file__)
+__getattr__, __dir__, _ = face(__name__, __file__)
+# Written out, as type checkers take imports for private that are in no list.
+__all__ = ["Accuracy", "Advice", "BrownConrady", "Change", "Cloud", "CloudFrame", "Comparison"]
+__all__ += ["Component", "Config", "Diagnostics", "Evaluation", "Fisheye", "FrameRecord"]
+__all__ += ["InputError", "Judgement", "Length", "LoopRecord", "Mapper", "Mesh", "OutputError"]
+__all__ += ["Pinhole", "PoseGraph", "RangeFrame", "Rational", "RayTable", "Reason"]
+__all__ += ["Reconstruction", "Recording", "Registration", "RegistrationError", "Result"]
+__all__ += ["SessionChange", "SessionPair", "SessionRecord", "TofuseError", "__version__"]
+__all__ += ["advise", "compare", "evaluate", "from_arrays", "inspect", "judge", "load", "merge"]
+__all__ += ["open", "reconstruct", "register"]

@@ -91,7 +91,9 @@ def test_equal_trajectories_have_no_notes():
 def test_what_python_prints_fits_a_line(result):
     located = result.locate(result.source[1])
     length = result.distance(*result.cloud.points[:2])
-    for shown in (result, result.graph, result.diagnostics, located, length):
+    cloud = tofuse.CloudFrame(0, 0.0, result.cloud.points)
+    table = tofuse.RayTable(result.source[0].camera.rays())
+    for shown in (result, result.graph, result.diagnostics, located, length, cloud, table):
         assert re.match(r"\w+(: | \d)", repr(shown))
         assert len(repr(shown)) < 120
     assert repr(result.diagnostics).startswith("Diagnostics: ")
@@ -142,6 +144,19 @@ def test_saved_result_round_trips(result, tmp_path):
     )
     assert {k for k in first if first[k] != second[k]} <= {"refinement", "sha256"}
     assert again.accuracy == result.accuracy
+
+
+def test_report_names_all_recordings_that_are_joined(result, arrays, tmp_path):
+    paths = [tmp_path / name for name in ("hall", "stairs")]
+    for path, half in zip(paths, (arrays[0][:3], arrays[0][3:]), strict=True):
+        convert(tofuse.from_arrays(half, arrays[1]), path)
+    opening = {"opening": {"paths": [str(path) for path in paths]}}
+    joined = replace(result, source=tofuse.open(*paths), recording={**result.recording, **opening})
+    joined.save(tmp_path / "out")
+    replace(joined, source=None).save(tmp_path / "again")
+    for name in ("out", "again"):
+        report = (tmp_path / name / "report.html").read_text()
+        assert "<title>hall, stairs – tofuse report</title>" in report
 
 
 def test_save_rejects_foreign_folder(result, tmp_path):
@@ -407,6 +422,17 @@ def test_points_that_are_masked_or_nan_are_none() -> None:
         np.testing.assert_array_equal(frame.amplitude, amplitude[21:])
     with pytest.raises(InputError, match="source: has 0 finite points"):
         tofuse.register(np.ma.masked_all((40, 3)), points.data)
+
+
+def test_clouds_that_would_lose_values_are_rejected() -> None:
+    points = np.random.default_rng(0).normal(size=(40, 3))
+    far = points + np.array([5e5, 4e6, 0])
+    with pytest.raises(InputError, match=r"points: are map coordinates.*use CloudFrame\.of"):
+        tofuse.CloudFrame(0, 0.0, far)
+    moved = tofuse.CloudFrame.of(far)
+    np.testing.assert_allclose(moved.points + moved.shift, far, atol=1e-6)
+    with pytest.raises(InputError, match="color: is float64; use uint8, from 0 to 255"):
+        tofuse.CloudFrame(0, 0.0, points, color=np.abs(points))
 
 
 def test_numbers_of_numpy_are_options(arrays) -> None:

@@ -301,3 +301,13 @@ def test_invalid_arguments_are_reported(words, text, tmp_path: Path, capsys) -> 
     assert text in found
     assert found.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_table_claims_a_bound_only_where_a_run_states_one(folder: BatchFolder) -> None:
+    # None: not finite, or of a single frame, and not assessed.
+    for job, bound in zip(JOBS, (0.012, None), strict=False):
+        done(Task(job, str(folder.path), 1), position_m=bound)
+    write_table(JOBS[:2], folder)
+    page = folder.html.read_text(encoding="utf-8")
+    assert '<td class="number">±12 mm</td>' in page
+    assert '<td class="number">no bound</td>' in page

@@ -199,7 +199,7 @@ def test_command_writes_camera_for_readers(
     assert main([*command, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "fx 2" in printed
-    assert "+-" in printed
+    assert "(sigma " in printed
     about = json.loads(out.read_text())
     assert about["depth_unit_m"] == 0.0001
     assert about["amplitude_kind"] == "range_compensated"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,7 @@ def test_all_files_are_written(files, tmp_path, capfd) -> None:
     assert max(abs(float(row["deviation_m"])) for row in rows) > 0.004
     page = (out / "report.html").read_text()
     assert "deviation, mm" in page
+    assert re.search(r"<li>[^<]*part\.ply is taken to be in mm: [^<]*\.</li>", page)
     assert "<strong>Fail</strong>" in page
     # A comparison may be replaced, other files may not.
     refuses(capfd, *words, "--out", out, says=("--overwrite",))

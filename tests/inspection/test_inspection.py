@@ -445,6 +445,7 @@ def test_wrong_focal_length_is_estimated_from_range(factor) -> None:
     wrong = replace(BROWN, fx=70 * factor, fy=70 * factor)
     reported = tofuse.inspect(of(seen_by(frames, wrong)), quick=True).findings
     (found,) = [f for f in reported if f.code == "focal_length"]
+    assert f"(sigma {found.evidence['sigma']:.2f})" in found.text  # elsewhere ± is of 95 %
     assert found.evidence["factor"] == pytest.approx(1 / factor, abs=0.09)
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -52,6 +54,16 @@ def test_run_with_report_does_not_load_matplotlib(room_recording, tmp_path) -> N
     )
     assert "STATUS 0 False" in done.stdout, done.stderr
     assert "data-chart=" in (tmp_path / "result" / "report.html").read_text(encoding="utf-8")
+
+
+def test_public_names_are_written_out() -> None:
+    """Type checkers of other packages take imports for private unless a literal lists them."""
+    listed = []
+    for line in ast.parse(Path(tofuse.__file__).read_text(encoding="utf-8")).body:
+        target = getattr(line, "target", None) or getattr(line, "targets", [None])[0]
+        if isinstance(target, ast.Name) and target.id == "__all__":
+            listed += ast.literal_eval(line.value)
+    assert listed == tofuse.__all__
 
 
 def test_public_names_exist() -> None:

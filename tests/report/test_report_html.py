@@ -264,6 +264,16 @@ def test_summary_of_a_single_image_speaks_of_no_parts(tmp_path):
     assert "deep, and was seen by a single image." in " ".join(summary.split())
 
 
+def test_a_single_image_has_no_accuracy_of_its_pose(tmp_path):
+    first = FrameRecord(0, 0.0, "tracked", covariance=np.zeros((6, 6)))
+    cloud = replace(lonely().cloud, sigma=np.full(3, 0.01, np.float32))
+    got = page(tmp_path, lonely(frames=(first,), cloud=cloud), ReportExtras("x"))
+    scene = json.loads(got.scripts[0])
+    assert scene["frames"]["errors"] is None
+    assert scene["fields"]["accuracy"]["labels"][0] == "±20 mm"
+    assert "accuracy below" not in got.text
+
+
 def test_summary_names_the_fault_of_the_recording(tmp_path):
     text = "The median depth is 11 m. Check depth_unit_m."
     result = lonely(verdict="degraded", reasons=(Reason("faulty_recording", ((0, 0),), text),))

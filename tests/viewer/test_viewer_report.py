@@ -62,6 +62,8 @@ def made(tmp_path_factory):
     )
     (folder / "out" / "component-1").mkdir()
     (folder / "out" / "component-1" / "report.html").write_text("<html>another</html>")
+    for name in ("changes.ply", "mirrors.ply"):
+        (folder / "out" / name).write_text(name)
     return frames, folder / "out"
 
 
@@ -100,6 +102,8 @@ def test_report_and_images_of_frames_are_served(made, server) -> None:
     opening = f'<html data-frames="{urlsplit(server.address).path}frame/"'.encode()
     assert page == report.replace(b"<html", opening, 1) != report
     assert ask(server, "/component-1/report.html")[0] == 200
+    for name in ("changes.ply", "mirrors.ply"):
+        assert ask(server, f"/{name}") == (200, name.encode())
     for k in (0, 9, 23):  # lost frames, too
         status, png = ask(server, f"/frame/{k}.png")
         assert status == 200

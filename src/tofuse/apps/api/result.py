@@ -125,7 +125,9 @@ class Result(Reconstruction):
             )
             write_report_files(self.source, config, result, folder)
             return
-        title = Path(str(result.recording["path"] or result.recording["format"])).name
+        facts = result.recording
+        opened = (facts.get("opening") or {}).get("paths") or [facts["path"] or facts["format"]]
+        title = ", ".join(Path(str(path)).name for path in opened)
         write_report(result, folder / "report.html", ReportExtras(title))
 
     def evaluate(

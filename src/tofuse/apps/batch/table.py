@@ -90,7 +90,7 @@ def _row(job: Job, record: Record, folder: BatchFolder) -> dict[str, str | int]:
         accuracy = f"±{length(record.position_m)}"
         accuracy += "" if record.relative is None else f" ({100 * record.relative:.2g} %)"
     elif done:
-        accuracy = "not bounded"
+        accuracy = "no bound"  # not finite, or not assessed
     has_report = (folder.result(job) / "report.html").is_file()
     picture = folder.picture(job)
     return {

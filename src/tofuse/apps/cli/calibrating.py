@@ -200,4 +200,4 @@ def _number(camera: Pinhole, name: str, sigma: float | None) -> str:
     if sigma is None:
         return f"{name} {value:.6g} (fixed)"
     digits = 2 if name in ("fx", "fy", "cx", "cy") else 5
-    return f"{name} {value:.{digits}f} +- {sigma:.{digits}f}"
+    return f"{name} {value:.{digits}f} (sigma {sigma:.{digits}f})"

@@ -84,7 +84,7 @@ def check_lens(sample: Sample) -> Iterator[Finding]:
         yield Finding(
             "focal_length",
             "The focal length does not match these images: planes are distorted least at "
-            f"{factor:.2f} times the stated one (+-{focal_sigma:.2f}).",
+            f"{factor:.2f} times the stated one (sigma {focal_sigma:.2f}).",
             "Use the intrinsics of the depth camera, at this resolution; not those of the colour "
             "camera.",
             {"factor": factor, "sigma": focal_sigma},
@@ -94,7 +94,7 @@ def check_lens(sample: Sample) -> Iterator[Finding]:
         yield Finding(
             "lens_distortion",
             f"Planes are distorted as by an uncorrected lens: rays at the corners deviate by "
-            f"{100 * stretch:+.1f} % (+-{percent(sigma)}).",
+            f"{100 * stretch:+.1f} % (sigma {percent(sigma)}).",
             "Add the distortion of the lens, or its rays, to camera.json; or remove them if depth "
             "is undistorted already.",
             {"stretch": stretch, "sigma": sigma},

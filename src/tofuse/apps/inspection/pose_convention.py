@@ -241,7 +241,7 @@ def misread_poses(sample: Sample, poses: Float64) -> Iterator[Finding]:
         "depth_scale",
         f"{apart}: either the depth is {wrong}, or "
         + (f"they are in {unit}." if unit else "their positions are not in metres."),
-        f"If the poses are right, multiply the depth by {factor:.3g} +-{sigma:.1g}"
+        f"If the poses are right, multiply the depth by {factor:.3g} (sigma {sigma:.1g})"
         + (f" (depth_unit_m: {stated * factor:.3g})" if isinstance(stated, float) else "")
         + "; else scale their positions.",
         {"factor": factor, "sigma": sigma},

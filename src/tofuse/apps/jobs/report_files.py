@@ -22,6 +22,7 @@ from tofuse.formats.geometry import read_ply
 
 _DRAWN_CLOUDS = 12  # views in the report, if they are clouds
 _TRUTH_POINTS = 100_000
+_TITLE_NAMES = 3  # of joined recordings
 
 
 @timing("report")
@@ -38,7 +39,7 @@ def write_report_files(
     with timing("imports"):
         from tofuse.apps.report import ReportExtras, write_report
 
-    title = _title(Path(recording.path)) or recording.path
+    title = _title(recording)
     truth = truth_points(recording)
     component = folders.component_number(folder)
     if component is not None:
@@ -64,8 +65,20 @@ def _frames_of(recording: Recording, result: Reconstruction) -> Recording:
     return replace(recording, indices=recording.indices[np.isin(recording.indices, frames)])
 
 
-def _title(path: Path) -> str:
-    """Return the name of a recording; that of its folder for a native recording in a result."""
+def _title(recording: Recording) -> str:
+    """Return the name of a recording, or the names of those that it is joined of."""
+    path = Path(recording.path)
+    joined = [part["name"] for part in recording.metadata.get("parts", ())]
+    joined = recording.metadata.get("cameras", joined)
+    if path.exists() or not joined:
+        return _name(path) or recording.path
+    names = [_name(Path(name)) for name in joined[:_TITLE_NAMES]]
+    more = len(joined) - len(names)
+    return ", ".join(names) + (f" and {more} more" if more else "")
+
+
+def _name(path: Path) -> str:
+    """Return the name of a path; that of its folder for a native recording in a result."""
     name = path.stem if path.suffix.lower() == ".zip" else path.name
     return (path.parent.name if path.name == folders.RECORDING else "") or name
 

@@ -95,6 +95,7 @@ def _environment() -> Any:
         "degrees": math.degrees,
         "percent": quantities.percent,
         "duration": words.seconds,
+        "sentence": words.sentence,
         "things": quantities.count,
         "more": words.more,
         "coordinates": words.coordinates,

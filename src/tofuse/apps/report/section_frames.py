@@ -48,7 +48,7 @@ def frames(s: Subject) -> Values:
         "strip": _strip(records, components),
         "label": ", ".join(f"{n} {name}" for name, n in counts),
         "found": words.frame_range(records[0].index, records[-1].index) if records else "",
-        "bounded": any(r.covariance is not None for r in records),
+        "bounded": sum(r.covariance is not None for r in records) > 1,
         "figures": _health(records),
         "has_bad": "lost" in statuses or "skipped" in statuses,
         "player": _player(s),

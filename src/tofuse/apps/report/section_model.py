@@ -130,7 +130,8 @@ def packed_lengths(errors: LengthErrors) -> Values:
 def position_errors(s: Subject) -> Float64:
     """Return (N,) 95 % bounds in m of the camera centres, in the worst direction.
 
-    `UNKNOWN_M` where a pose is not bounded, NaN where there is none or it was not assessed.
+    `UNKNOWN_M` where a pose is not bounded, NaN where there is none or it was not assessed. The
+    only camera defines the world: nothing was assessed.
     """
     covariances = {r.index: r.covariance for r in s.result.diagnostics.frames}
     unbounded = set(s.result.diagnostics.accuracy.unbounded)
@@ -142,7 +143,7 @@ def position_errors(s: Subject) -> Float64:
         elif C is not None and np.isfinite(C).all():
             errors[row] = OF_95_PERCENT * float(se3.largest_sigmas(C)[0])
     errors[~s.result.has_pose] = np.nan
-    return errors
+    return errors if np.isfinite(errors).sum() > 1 else np.full_like(errors, np.nan)
 
 
 def views(s: Subject) -> Values:

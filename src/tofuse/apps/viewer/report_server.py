@@ -92,8 +92,9 @@ def report_pages(folder: Path) -> dict[str, tuple[str, bytes]]:
     for path in sorted(folder.glob("component-*/report.html")):
         if folders.component_number(path.parent) is not None:
             pages[f"{path.parent.name}/report.html"] = _HTML, reading.read_bytes(path)
-    if (folder / "changes.ply").is_file():
-        pages["changes.ply"] = _PLY, reading.read_bytes(folder / "changes.ply")
+    for name in ("changes.ply", "mirrors.ply"):  # to which the report links
+        if (folder / name).is_file():
+            pages[name] = _PLY, reading.read_bytes(folder / name)
     return pages
 
 

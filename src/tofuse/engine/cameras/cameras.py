@@ -7,7 +7,7 @@ range to x, y, z (eqs 2.3 to 2.5), follows from the rays and is the same for eve
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -253,9 +253,12 @@ class RayTable:
     Projection iterates from a pinhole fit by Newton's method.
     """
 
-    table: Float32 = field(repr=False)
+    table: Float32
 
     model = "rays"
+
+    def __repr__(self) -> str:
+        return f"RayTable: {self.width} x {self.height}"
 
     def __post_init__(self) -> None:
         table = np.asarray(self.table)

@@ -287,6 +287,9 @@ class CloudFrame:
     shift: Float64 = field(default_factory=lambda: np.zeros(3))
     up: Float64 | None = None
 
+    def __repr__(self) -> str:
+        return f"CloudFrame {self.index}: {len(self):,} points at {self.timestamp:.3f} s"
+
     def __post_init__(self) -> None:
         _check_frame(self)
         is_array = isinstance(self.points, np.ndarray) and self.points.dtype.kind in "fiu"
@@ -307,6 +310,12 @@ class CloudFrame:
                 f"points have coordinates up to {largest:.0e} m",
                 where=f"frame {self.index}",
                 remedy="use metres, and leave out invalid points",
+            )
+        if points.dtype != np.float32 and map_shift(points[valid]).any():
+            raise InputError(
+                "are map coordinates, which exceed the precision of float32",
+                where=f"frame {self.index}: points",
+                remedy="use CloudFrame.of(points), which keeps what it subtracts as shift",
             )
         object.__setattr__(self, "points", np.asarray(points, np.float32))
         for name in ("origin", "shift"):
@@ -500,7 +509,7 @@ def _filled(points: ArrayLike) -> NDArray[Any]:
 
 
 def _check_columns(index: int, count: int, columns: Mapping[str, ArrayLike | None]) -> None:
-    """Raise InputError if a column of a cloud has no value for each point."""
+    """Raise InputError if a column of a cloud doesn't suit its points, or colour isn't uint8."""
     for name, column in columns.items():
         shape = (count, 3) if name in ("points", "normals", "color") else (count,)
         if column is not None and np.shape(column) != shape:
@@ -508,6 +517,12 @@ def _check_columns(index: int, count: int, columns: Mapping[str, ArrayLike | Non
                 f"has shape {np.shape(column)}, not {shape}",
                 where=f"frame {index}: {name}",
                 remedy="pass a value for each point",
+            )
+        if name == "color" and column is not None and np.asarray(column).dtype != np.uint8:
+            raise InputError(
+                f"is {np.asarray(column).dtype}",
+                where=f"frame {index}: color",
+                remedy="use uint8, from 0 to 255",
             )
 
 

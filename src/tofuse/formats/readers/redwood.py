@@ -64,7 +64,8 @@ class Redwood(Reader):
             file = _camera_file(path)
             if file is None:
                 warnings.append(
-                    "no camera .json: the PrimeSense default is used (525 px); --camera to change"
+                    "no camera .json: the PrimeSense default is used (525 px); "
+                    "pass another by --camera"
                 )
             else:
                 camera = _read_camera(file, camera.sensor)

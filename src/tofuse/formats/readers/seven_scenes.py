@@ -112,7 +112,7 @@ def _camera(folder: Path, files: Sequence[Path], default: _Camera, warnings: lis
             return _read_info(info, warnings)
     warnings.append(
         f"no {_INTRINSICS} or info.txt: the camera of 7-Scenes is used "
-        f"({DEFAULT_CAMERA.fx:.0f} px); --camera to change"
+        f"({DEFAULT_CAMERA.fx:.0f} px); pass another by --camera"
     )
     return default
 

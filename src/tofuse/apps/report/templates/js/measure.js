@@ -37,7 +37,7 @@ function makeMeasure(box, view, painter, { sigmaOf, axes, lengths, changed }) {
   const inWorld = (point) => (axes ? [0, 1, 2].map((k) => dot(axes.map((row) => row[k]), point)) : point);
   function position() {
     const [{ point, sigma }] = ends;
-    return bounded(`${inWorld(point).map((value) => value.toFixed(3).replace("-", "−")).join(", ")} m`, sigma, 1);
+    return repeatable(`${inWorld(point).map((value) => value.toFixed(3).replace("-", "−")).join(", ")} m`, sigma, 1);
   }
   function distance() {
     const [a, b] = ends, length = Math.hypot(...minus(a.point, b.point));
@@ -48,7 +48,12 @@ function makeMeasure(box, view, painter, { sigmaOf, axes, lengths, changed }) {
       return words.includes("±") ? `${words}\nmostly ${CAUSES[most]}` : words;
     }
     const known = a.sigma !== null && b.sigma !== null;
-    return bounded(metres(length), known ? Math.hypot(a.sigma, b.sigma) : null, Math.max(length, 1));
+    return repeatable(metres(length), known ? Math.hypot(a.sigma, b.sigma) : null, Math.max(length, 1));
+  }
+  // The bounds of single points don't include what all views have in common.
+  function repeatable(words, bound, most) {
+    const said = bounded(words, bound, most);
+    return said.includes("±") ? `${said}\nwithout range errors` : said;
   }
   function bounded(words, bound, most) {
     if (bound === null) return words;
