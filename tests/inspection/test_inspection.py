@@ -12,10 +12,17 @@ import cv2
 import numpy as np
 import pytest
 
+import made_rooms
 import tofuse
 from ray_casting import rays_at, to_room, to_walls
 from tofuse.apps.cli.program import main
-from tofuse.apps.inspection.channels import _delay, _log_depth, check_mirrored
+from tofuse.apps.inspection.channels import (
+    _correlations,
+    _delay,
+    _log_depth,
+    _repeats,
+    check_mirrored,
+)
 from tofuse.apps.inspection.finding import CODES, Finding
 from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.apps.inspection.planar import Distortion
@@ -376,6 +383,20 @@ def test_outline_of_a_turntable_before_nothing_is_not_mirrored() -> None:
     assert not list(check_mirrored(Sample.of(of(frames), 8)))
 
 
+def test_room_with_a_dark_floor_is_not_mirrored() -> None:
+    """Depth is nearly the same upside down, so the floor's edge decides what fits better."""
+    camera = Pinhole(128, 96, 60.0, 60.0, 63.5, 47.5)
+    y, frames = -0.05, []
+    for k in range(16):
+        T = made_rooms.at(0.1, 0.0, k * np.pi / 8, pitch=0, y=y)
+        frame = made_rooms.seen(T, k, boxes=(), spots=0, noise=0.002, camera=camera)
+        height = frame.camera.rays()[..., 1] * frame.z + y
+        albedo = np.select([height > 1.07, height < -1.07], [0.15, 1.6], 1.0)
+        light = (albedo * frame.amplitude_image / frame.radial_range**2).astype(np.float32)
+        frames.append(replace(frame, amplitude_image=light, amplitude_kind="raw"))
+    assert not list(check_mirrored(Sample.of(of(frames), 8)))
+
+
 def test_depth_beyond_a_wrong_ambiguity_range_is_not_of_a_wrong_unit() -> None:
     inspected = tofuse.inspect(of([image(2.5)], metadata={"ambiguity_m": 0.5}))
     (found,) = [f for f in inspected.findings if f.code == "depth_unit"]
@@ -426,6 +447,21 @@ def test_shift_that_does_not_follow_the_motion_is_no_delay() -> None:
     assert _delay(-2 * varied + noise, varied) == pytest.approx(2, abs=0.1)
     # Both explain that.
     assert _delay(constant, steady) == pytest.approx(-1, abs=0.1)
+
+
+def test_edges_that_repeat_along_the_motion_show_no_delay() -> None:
+    y, x = np.mgrid[:72, :96]
+    stairs, floor = (y % 12 < 2).astype(np.float32), (y // 2 == 20).astype(np.float32)
+    corner = np.maximum(floor, x // 2 == 20).astype(np.float32)
+    down, right = np.array([[0.3, 2.0], [2.0, 0.3]])
+    for edges, repeats in (
+        (stairs, (True, True)),
+        (floor, (False, True)),
+        (corner, (False, False)),
+    ):
+        shifted = np.roll(edges, 3, 0)
+        scores = _correlations([(edges, shifted)], 15)[0]
+        assert (_repeats(scores, down), _repeats(scores, right)) == repeats
 
 
 @pytest.mark.nightly_part

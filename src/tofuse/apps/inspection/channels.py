@@ -27,6 +27,9 @@ _ORIENTATIONS: dict[str, Callable[[Float32], Float32]] = {
 # Minimum correlation of the edges of two channels, and its lead over the identity, also in standard
 # errors.
 _MIN_CORRELATION, _MIN_LEAD, _MIN_LEAD_SIGMAS = 0.1, 0.06, 4.0
+# Maximum correlation of the edges of depth with the same ones mirrored: in a symmetric scene edges
+# that only one of the channels has decide which orientation fits better.
+_MAX_SYMMETRY = 0.75
 # Minimum relevant and maximum tested shift of colour, as fractions of the width.
 _MIN_SHIFT, _MAX_SHIFT = 0.02, 0.12
 _MIN_FRAMES = 3
@@ -51,9 +54,10 @@ def check_mirrored(sample: Sample) -> Iterator[Finding]:
     """Check that edges of depth and amplitude (else colour) do not match better if mirrored."""
     for name, channel_of in (("amplitude", _amplitude), ("colour", _grey)):
         # Without the outline of what has a depth, which is no edge of depth.
+        depicted = [f for f in _shiftable(sample.images) if channel_of(f) is not None]
         images = [
             (_oriented_edges(_log_depth(f)), _filled(image, f.valid))
-            for f in _shiftable(sample.images)
+            for f in depicted
             if (image := channel_of(f)) is not None
         ]
         if len(images) < _MIN_FRAMES:
@@ -68,6 +72,13 @@ def check_mirrored(sample: Sample) -> Iterator[Finding]:
         if best.mean() <= _MIN_CORRELATION or not is_significant(
             best - identity, _MIN_LEAD, _MIN_LEAD_SIGMAS
         ):
+            continue
+        turn = _ORIENTATIONS[orientation]
+        symmetry = [
+            (depth, _oriented_edges(turn(_log_depth(f))))
+            for (depth, _), f in zip(images, depicted, strict=True)
+        ]
+        if _correlations(symmetry, 0).mean() > _MAX_SYMMETRY:
             continue
         # Unrelated edges in the same part of the images correlate too, but then those of another
         # frame or a shift fit as well.
@@ -157,8 +168,11 @@ def check_delay(sample: Sample) -> Iterator[Finding]:
         for edges in _edge_pairs([frame], _amplitude):
             columns = edges[0].shape[1]
             max_shift, scale = round(_MAX_DELAY_SHIFT * columns), columns / frame.camera.width
-            shifts.append(_peak(_correlations([edges], max_shift)[0]) - max_shift)
-            motions.append(scale * _image_motion(frame, T_first_second))
+            scores = _correlations([edges], max_shift)[0]
+            moved = scale * _image_motion(frame, T_first_second)
+            if not _repeats(scores, moved):
+                shifts.append(_peak(scores) - max_shift)
+                motions.append(moved)
     shift, motion = np.reshape(shifts, (-1, 2)), np.reshape(motions, (-1, 2))
     moves = np.linalg.norm(motion, axis=1) >= _MIN_MOTION_PX
     shift, motion = shift[moves], motion[moves]
@@ -327,6 +341,20 @@ def _correlations(edges: Sequence[tuple[Float32, Float32]], max_shift: int) -> F
 
 def _from_peak(scores: Float64) -> Float64:
     """Distance of each element of (H, W) scores from the largest one, pixels."""
+    return np.asarray(np.hypot(*_offsets(scores)))
+
+
+def _offsets(scores: Float64) -> tuple[Float64, Float64]:
+    """Offsets of each element of (H, W) scores from the largest one, down and right, pixels."""
     i, j = np.unravel_index(int(scores.argmax()), scores.shape)
-    down, right = np.indices(scores.shape)
-    return np.hypot(down - i, right - j)
+    down, right = np.indices(scores.shape, float)
+    return down - i, right - j
+
+
+def _repeats(scores: Float64, motion: Float64) -> bool:
+    """Whether scores (H, W) are as large farther along a motion (2,): edges of stairs repeat."""
+    down, right = _offsets(scores)
+    x, y = motion / max(float(np.linalg.norm(motion)), 1e-9)
+    along, across = np.abs(right * x + down * y), np.abs(right * y - down * x)
+    farther = scores[(along > _PEAK_RADIUS_PX) & (across < 0.5 * _PEAK_RADIUS_PX)]
+    return bool(farther.max(initial=0.0) > _MAX_ELSEWHERE * scores.max())

@@ -376,9 +376,8 @@ class Assessment:
         # A camera that seems to stand still has one stored view; it may move on by a period.
         if newest is not None and newest.index in poses.keys() - {view.index for view in views}:
             views = [*views, newest]
-        return tuple(
-            sorted({*ambiguous_frames(views, poses, moments), *ambiguous_places(views, poses)})
-        )
+        places = ambiguous_places(views, poses, moments)
+        return tuple(sorted({*ambiguous_frames(views, poses, moments), *places}))
 
     def _checked_views(
         self, graph: PoseGraph, *, with_open: bool = False

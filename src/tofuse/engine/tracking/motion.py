@@ -62,6 +62,11 @@ class FrameTime:
         timed = (self.is_timed or earlier.is_timed) and self.timestamp > earlier.timestamp
         return self.timestamp - earlier.timestamp if timed else None
 
+    def is_predictable_from(self, earlier: FrameTime) -> bool:
+        """Whether so little time passed since another frame that a prediction limits the motion."""
+        seconds = self.seconds_since(earlier)
+        return seconds is None or (seconds / _GATE_SECONDS) ** 2 < _MAX_GATE_SCALE
+
 
 class MotionModel:
     """The velocity of a camera, estimated from its poses, (4, 4) T_world_camera, so far.
