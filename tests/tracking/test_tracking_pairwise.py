@@ -13,6 +13,7 @@ from tofuse.engine.geometry import se3
 from tofuse.engine.tracking.pairwise import Pairwise
 
 ALONG_X = np.eye(6)[:1]
+POINTS = np.random.default_rng(0).uniform(-1, 1, (40, 3)).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,7 @@ def test_mean_motion_is_extrapolated_along_degenerate_directions() -> None:
     motions = (0.0, *[0.1] * 8, 0.13, *[0.1] * 6)
     method = Scripted(motions=motions, degenerate_from=10)
     tracker = Pairwise(registration=method).start(0)
-    points = np.random.default_rng(0).uniform(-1, 1, (40, 3)).astype(np.float32)
-    steps = [tracker.push(CloudFrame(k, float(k), points)) for k in range(len(motions))]
+    steps = [tracker.push(CloudFrame(k, float(k), POINTS)) for k in range(len(motions))]
     assert all(step.status == "tracked" for step in steps)
     # While all directions are constrained, the last motion is extrapolated.
     np.testing.assert_allclose(method.guesses[2:9], 0.1, atol=1e-9)
@@ -64,22 +64,29 @@ def test_mean_motion_is_extrapolated_along_degenerate_directions() -> None:
 def test_interruption_resets_predicted_motion() -> None:
     method = Scripted(motions=(0.0, 0.1, 0.1, 0.1))
     tracker = Pairwise(registration=method).start(0)
-    points = np.zeros((40, 3), np.float32)
     for k in (0, 1, 2):
-        tracker.push(CloudFrame(k, float(k), points))
+        tracker.push(CloudFrame(k, float(k), POINTS))
     tracker.interrupt()
-    tracker.push(CloudFrame(3, 3.0, points))
+    tracker.push(CloudFrame(3, 3.0, POINTS))
     np.testing.assert_allclose(method.guesses, [0.0, 0.1, 0.0], atol=1e-9)
+
+
+def test_guesses_far_from_the_pose_of_a_search_are_not_aligned() -> None:
+    method = Scripted(motions=(0.0, 2.0, 2.0, 2.0, 5.0, 8.0))
+    tracker = Pairwise(registration=method).start(0)
+    for k in range(6):
+        tracker.push(CloudFrame(k, float(k), POINTS))
+    # Not 0 for the first motion. Once confirmed, predictions are aligned before a search.
+    np.testing.assert_allclose(method.guesses, [2.0, 2.0, 2.0, 5.0], atol=1e-9)
 
 
 def test_odometry_of_another_recording_is_in_another_frame() -> None:
     method = Scripted(motions=(0.0, 0.1, 0.1, 0.1))
     tracker = Pairwise(registration=method, guess="odometry").start(0)
-    points = np.zeros((40, 3), np.float32)
     for k, x in enumerate((0.0, 0.1, 7.0, 7.1)):
         if k == 2:
             tracker.interrupt()
-        tracker.push(CloudFrame(k, float(k), points), se3.translation([x, 0, 0]))
+        tracker.push(CloudFrame(k, float(k), POINTS), se3.translation([x, 0, 0]))
     np.testing.assert_allclose(method.guesses, [0.1, 0.0, 0.1], atol=1e-9)
 
 

@@ -32,6 +32,9 @@ from tofuse.engine.views import PreparedView
 _MIN_CONFIRMED = 2
 # Poses that differ by less than this fraction of the extent are the same.
 _MAX_DIFFERENCE = 0.03
+# Guesses farther from a pose, as a fraction of the extent, are not expected to be aligned to it:
+# about the reach of ICP at its coarsest level.
+_MAX_PREDICTED = 0.3
 # Contradictions of two pairs of views, as fractions of the overlap, that differ by less are equal:
 # a few of the thousands of points that are compared.
 _CHANCE = 0.002
@@ -240,8 +243,11 @@ class _PairwiseTracker(Tracker):
             return Step("lost", f"{len(frame)} valid points, {min_points} are needed", None)
         references = [p for p in reversed(self._posed) if p.component == self._component]
         self._T_odometry, self._has_odometry = T_odometry, False
-        local = self._by_prediction(frame, references[0]) if references else None
+        guess = self._prediction(frame, references[0]) if references else np.eye(4)
         confirmed = sum(self._motion_confirmed) >= _MIN_CONFIRMED
+        local = None
+        if references and (confirmed or self._has_odometry):
+            local = self._locally(_unposed(frame), references[0], guess)
         if confirmed and local is not None and local.needs_no_search:
             return self._continue_component(frame, local)
         doubtful: list[_Registered] = []
@@ -254,7 +260,7 @@ class _PairwiseTracker(Tracker):
             registered = self._unless_contradicted(registered, doubtful)
             if registered.accepted:
                 if reference is references[0]:
-                    self._motion_confirmed.append(local is not None and local.agrees(registered))
+                    self._motion_confirmed.append(self._is_predicted(registered, guess, local))
                 return self._continue_component(frame, registered)
             doubtful.append(registered)
         if confirmed and self._has_odometry and local is not None and local.accepted:
@@ -270,8 +276,8 @@ class _PairwiseTracker(Tracker):
             return self._continue_component(frame, probable[0])
         return self._begin_component(frame, links, doubtful)
 
-    def _by_prediction(self, frame: Frame, last: _PosedView) -> _Registered | None:
-        """Register to the last view from the predicted pose.
+    def _prediction(self, frame: Frame, last: _PosedView) -> Float64:
+        """Return the predicted pose (4, 4) relative to the last view.
 
         Along a direction that is degenerate for many views, the noise of single motions would
         accumulate.
@@ -288,7 +294,15 @@ class _PairwiseTracker(Tracker):
         motion = _odometry_motion(last.T_odometry, self._T_odometry)
         if self._options.guess == "odometry" and motion is not None:
             guess, self._has_odometry = motion, True
-        return self._registered(_unposed(frame), last, guess, self._local_registration)
+        return guess
+
+    def _is_predicted(
+        self, searched: _Registered, guess: Float64, local: _Registered | None
+    ) -> bool:
+        """Whether alignment from a guess, which may be known, leads to the pose of a search."""
+        if local is None and searched.difference(guess) <= _MAX_PREDICTED:
+            local = self._locally(searched.view, searched.reference, guess)
+        return local is not None and local.agrees(searched)
 
     def _confirmed_by_odometry(
         self, searched: _Registered, local: _Registered | None
@@ -307,6 +321,12 @@ class _PairwiseTracker(Tracker):
     def _by_search(self, view: _PosedView, reference: _PosedView) -> _Registered | None:
         """Register to an earlier view by a global search."""
         return self._registered(view, reference, None, self._options.registration)
+
+    def _locally(
+        self, view: _PosedView, reference: _PosedView, guess: Float64
+    ) -> _Registered | None:
+        """Register to an earlier view from a guess."""
+        return self._registered(view, reference, guess, self._local_registration)
 
     def _registered(
         self, view: _PosedView, reference: _PosedView, guess: Float64 | None, method: AnyPair
@@ -353,7 +373,7 @@ class _PairwiseTracker(Tracker):
         """Return the contradiction of the views of a registration if components are so posed."""
         view, reference = pair.view, pair.reference
         guess = se3.inverse(reference.T_component_view) @ T_components @ view.T_component_view
-        local = self._registered(view, reference, guess, self._local_registration)
+        local = self._locally(view, reference, guess)
         return 0.0 if local is None else local.registration.contradiction or 0.0
 
     def _continue_component(self, frame: Frame, registered: _Registered) -> Step:
@@ -440,12 +460,18 @@ class _Registered:
         return T @ se3.inverse(self.view.T_component_view)
 
     def agrees(self, other: _Registered) -> bool:
-        """Whether both map the view's points to the same place, relative to their extent."""
+        """Whether both map the view's points to the same place."""
+        T_other = other.T_components @ self.view.T_component_view
+        T_reference_component = se3.inverse(self.reference.T_component_view)
+        return self.difference(T_reference_component @ T_other) <= _MAX_DIFFERENCE
+
+    def difference(self, T_target_source: Float64) -> float:
+        """Rms distance of the view's points at another pose, as a fraction of their extent."""
         points = self.view.frame.points
-        T, T_other = (r.T_components @ self.view.T_component_view for r in (self, other))
-        difference = se3.transform(T, points) - se3.transform(T_other, points)
+        difference = se3.transform(self.registration.T_target_source, points)
+        difference -= se3.transform(T_target_source, points)
         rms = np.sqrt((difference**2).sum(1).mean())
-        return bool(rms <= _MAX_DIFFERENCE * extent(points))
+        return float(rms / max(extent(points), np.finfo(float).tiny))
 
     @property
     def probability(self) -> float:
