@@ -128,6 +128,17 @@ def test_fit_is_robust_to_outliers() -> None:
     assert rms(curve_error(calibrate_depth(views, CAMERA))) < 0.0015
 
 
+def test_pixels_beyond_the_ends_of_the_curve_do_not_bend_it() -> None:
+    views = []
+    for view in made_views(known=True)[::2]:
+        true = 1 / (view.directions @ view.plane)
+        measured = 0.01 + 1.004 * true
+        views.append(replace(view, information=np.eye(3) * 1e6, measured_m=measured))
+    correction = calibrate_depth(views, CAMERA).correction
+    error = correction.bias_m - (correction.range_m - (correction.range_m - 0.01) / 1.004)
+    assert np.abs(error).max() < 5e-5
+
+
 @pytest.mark.parametrize("size", [1.0, 0.97])
 def test_wrong_size_of_the_board_is_suspected(size: float) -> None:
     """Planes of a board whose squares are said to be larger are too far: ranges seem too short."""

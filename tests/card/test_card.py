@@ -230,6 +230,16 @@ def test_detectable_change_is_found_as_often_as_stated(spread: float) -> None:
     assert 0.4 < few.detectable(2, 4) / few.detectable(2) < 0.5
 
 
+@pytest.mark.parametrize("results", [4, 6])
+def test_few_results_find_a_change_as_often_as_stated(results: int) -> None:
+    """Whatever their scatter happens to be."""
+    t, s = np.linspace(0, 1, results), np.ones(results)
+    limit = drift_of(t, np.zeros(results), s, trend=True).detectable(2)
+    draws = np.random.default_rng(4).normal(size=(1000, results)) + limit * t
+    found = [drift_of(t, y, s, trend=True).p_alone < SIGNIFICANCE / 2 for y in draws]
+    assert np.mean(found) == pytest.approx(0.95, abs=0.02)
+
+
 def test_card_says_which_change_of_the_range_it_would_find(tmp_path: Path) -> None:
     card = make_card(campaign(tmp_path))
     (said,) = [w for w in card.warnings if w.startswith("A change of the range offset is found")]

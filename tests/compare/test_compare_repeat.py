@@ -11,7 +11,8 @@ import pytest
 
 from measured_parts import NOISE, drawn, scan
 from tofuse.apps.compare import comparing
-from tofuse.apps.compare.nearest import Reference
+from tofuse.apps.compare.deviations import mapped
+from tofuse.apps.compare.nearest import Reach, Reference
 from tofuse.apps.compare.repeating import (
     Session,
     _pose_differences,
@@ -19,6 +20,7 @@ from tofuse.apps.compare.repeating import (
     loaded_sessions,
     repeated,
 )
+from tofuse.apps.compare.surface import spacing_of
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.progress import Silent
@@ -75,6 +77,20 @@ def test_differences_between_sessions_are_separated() -> None:
     assert found.to_dict()["components"][0]["unit"] == "m"
 
 
+def test_the_noise_of_the_reference_is_not_in_the_bounds_of_differences() -> None:
+    part = Reference.of(drawn())
+    first, second = (scan(part, k, 12_000, NOISE) for k in range(2))
+    reference = Reference.of(first)
+    reach = Reach.of(reference, spacing_of(first.points))
+    places = mapped(first, reference, np.eye(4), reach).places
+    with_reference, alone = (
+        mapped(second, reference, np.eye(4), reach, centres=centres).places
+        for centres in (None, places)
+    )
+    variance, own = (np.median(at.sigma**2 * at.points) for at in (with_reference, alone))
+    assert own == pytest.approx(0.5 * variance, rel=0.15)  # both surfaces have the same noise
+
+
 def test_another_place_is_refused(monkeypatch) -> None:
     """Also without a bound on its poses, which alone is no reason."""
     one, other = (
@@ -91,10 +107,24 @@ def test_another_place_is_refused(monkeypatch) -> None:
                 repeated([one, other])
 
 
+def with_poses(trajectories: list[np.ndarray], shift: np.ndarray) -> list[Session]:
+    results = [SimpleNamespace(trajectory=each, shift=shift) for each in trajectories]
+    return [Session("", "", result, None) for result in results]  # type: ignore[arg-type]
+
+
+def test_poses_in_map_coordinates_are_those_of_their_surfaces() -> None:
+    path = se3.exp(np.linspace(0, 1, 5)[:, None] * np.eye(6)[0])
+    shift, turn = np.array([500_000.0, 5_000_000.0, 0.0]), se3.exp(0.02 * np.eye(6)[5])
+    other = se3.translation(shift) @ turn @ se3.translation(-shift)  # of what is in its file
+    results = with_poses([path, se3.inverse(turn) @ path], shift)
+    motions = _pose_differences(results, np.stack([np.eye(4), other]), 4.0)
+    np.testing.assert_allclose(motions, 0.0, atol=1e-6)
+
+
 def test_a_camera_that_turned_elsewhere_did_not_repeat_its_path() -> None:
     turns = se3.exp(np.linspace(0, 0.6, 5)[:, None] * np.eye(6)[4])
     ends = [turns, turns @ se3.exp(0.02 * np.eye(6)[4]), turns @ se3.exp(0.3 * np.eye(6)[4])]
-    results = [Session("", "", SimpleNamespace(trajectory=t), None) for t in ends]  # type: ignore[arg-type]
+    results = with_poses(ends, np.zeros(3))
     same = _pose_differences(results[:2], np.stack([np.eye(4)] * 2), 4.0)
     np.testing.assert_allclose(same[:, 4, 1], 0.02)
     assert "did not repeat" in _pose_differences(results[::2], np.stack([np.eye(4)] * 2), 4.0)

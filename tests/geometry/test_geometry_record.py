@@ -65,6 +65,19 @@ def test_obj_that_fails_leaves_the_earlier_texture(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
 
 
+@pytest.mark.parametrize("unknown", [[0.1, np.nan, 0.3], [np.nan] * 3])
+def test_e57_keeps_unknown_values(tmp_path: Path, unknown: list[float]) -> None:
+    pye57 = pytest.importorskip("pye57")
+    path, sigma = tmp_path / "a.e57", np.array(unknown, np.float32)
+    write_e57(path, GeometryRecord(POINTS, normals=POINTS * np.nan, scalars={"sigma": sigma}))
+    file = pye57.E57(str(path))
+    read, buffers = np.empty(3, np.float32), pye57.libe57.VectorSourceDestBuffer()
+    buffers.append(pye57.libe57.SourceDestBuffer(file.image_file, "tofuse:sigma", read, 3))
+    file.get_header(0)["points"].reader(buffers).read()
+    np.testing.assert_array_equal(read, sigma)
+    file.close()
+
+
 def test_full_disk_for_e57(tmp_path: Path) -> None:
     pytest.importorskip("pye57")
     resource = pytest.importorskip("resource")

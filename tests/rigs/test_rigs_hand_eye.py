@@ -5,7 +5,7 @@ import pytest
 
 from pose_errors import assert_near
 from tofuse.apps.rigs.clocks import lag_between
-from tofuse.apps.rigs.hand_eye import Track, clock_of, hand_eye
+from tofuse.apps.rigs.hand_eye import Track, clock_of, combined, hand_eye
 from tofuse.engine.geometry import se3
 from tofuse.lab.simulation.rig import wander
 from tofuse.lab.world.paths import rotation
@@ -99,3 +99,15 @@ def test_rotation_about_one_axis_does_not_constrain_height() -> None:
     # Along the rotation axis, in b's frame.
     axis = found.T_a_b[:3, :3].T @ [0.0, 1.0, 0.0]
     assert np.sqrt(axis @ found.covariance[:3, :3] @ axis) > 0.1
+
+
+def test_fits_of_the_same_poses_are_not_combined_as_independent_ones() -> None:
+    a, b = tracks()
+    b = Track(b.times, mounted() @ b.poses)  # in the world of the first camera
+    free, common = (hand_eye(a, b, OFFSET, common_world=known) for known in (False, True))
+    exact = combined(free, common, np.zeros((6, 6)))
+    np.testing.assert_allclose(exact.T_a_b, common.T_a_b, atol=1e-12)
+    np.testing.assert_allclose(exact.covariance, common.covariance, rtol=1e-6)
+    unknown = combined(free, common, np.eye(6))  # the common world may be deformed in any way
+    assert_near(unknown.T_a_b, free.T_a_b, 1e-3, 0.02)
+    assert np.trace(unknown.covariance) == pytest.approx(np.trace(free.covariance), rel=0.1)

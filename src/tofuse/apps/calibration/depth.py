@@ -219,12 +219,15 @@ def _solve(views: Sequence[PlaneView], knots: Float64, *, fixed: bool = False) -
     information = block_diag(prior, *(view.information for view in views))
     for _ in range(_ROUNDS):
         true = 1 / np.einsum("nc,nc->n", planes[view_of], directions)
-        knot, fraction = _interval(_measured_of_true(true, knots, curve), knots)
+        expected = _measured_of_true(true, knots, curve)
+        knot, fraction = _interval(expected, knots)
         bias = curve[knot] * (1 - fraction) + curve[knot + 1] * fraction
         residual = measured - true - bias - offsets[pixel]
         scale = max(robust_sigma(residual / sigma), 0.1)
         weight = 1 / (sigma * scale) ** 2
         weight *= np.minimum(1, _HUBER * scale * sigma / np.maximum(np.abs(residual), 1e-12))
+        # The curve says nothing of what is beyond it, which would bend planes and curve.
+        weight *= (expected >= knots[0]) & (expected <= knots[-1])
         # Columns: two knots, three parameters of the plane. d(true) = -true^2 ray . d(plane).
         slope = -(true**2)[:, None] * directions
         columns = np.stack([knot, knot + 1, *(knot_count + 3 * view_of + a for a in range(3))], 1)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc, stdtr, stdtrit
+from scipy.special import chdtrc, nctdtrinc, stdtr, stdtrit
 
 from tofuse.engine.arrays import Float64
 
@@ -59,7 +59,7 @@ class Drift:
         if self.change_sigma is None:
             return np.nan
         dof = more * self.results - 2
-        found = stdtrit(dof, 1 - 0.025 / tests) + stdtrit(dof, 0.95)
+        found = nctdtrinc(dof, 0.05, stdtrit(dof, 1 - 0.025 / tests))
         return float(self.change_sigma * found / np.sqrt(more))
 
     @property

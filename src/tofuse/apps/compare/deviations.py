@@ -256,7 +256,8 @@ def mapped(
     free
         Number of motions that are not determined.
     centres
-        Places to use, for comparing several surfaces at the same ones.
+        Places to use, for comparing several surfaces at the same ones: by differences between
+        them, in which the noise of the reference cancels, so that it is in no covariance.
     """
     chosen = scene.random_subset(len(measured.points), _MAX_POINTS)
     points = se3.transform(T, measured.points[chosen])
@@ -271,9 +272,10 @@ def mapped(
     compared = np.flatnonzero(np.isfinite(deviation))
     beyond = 1 - float(found.compared.mean())
     seen = _seen(reference, found, spacing)
-    stated = None if measured.sigma is None else measured.sigma[chosen]
-    if stated is not None and reference.sigma is not None:
-        stated = np.hypot(stated, reference.sigma[found.element])
+    own = None if measured.sigma is None else measured.sigma[chosen]
+    stated = own
+    if own is not None and reference.sigma is not None:
+        stated = np.hypot(own, reference.sigma[found.element])
     feet, region = found.feet[compared], reference.region[found.element[compared]]
     d = deviation[compared]
     if centres is None:
@@ -298,6 +300,8 @@ def mapped(
     variance = sums.mean(sigma**2)
     expected = variance * (1 + 2 * np.sqrt(2 * correlation / np.maximum(n, 1)))
     uneven = np.maximum(sums.mean(scatter**2) - expected, 0.0)
+    if centres is not None and own is not None:  # that of the reference is common to all surfaces
+        variance = sums.mean((scale * own[compared]) ** 2)
     variance_of_mean = (variance + uneven) / np.maximum(n / correlation, 1.0)
     p, normal = sums.mean3(feet), unit_vectors(sums.mean3(found.normals[compared]))
     covariance = _covariance(p, normal, n, variance_of_mean, shared_m, reference.diagonal)

@@ -283,7 +283,7 @@ def _pose_differences(
 ) -> Float64 | str:
     """Return differences (F, 6, R) of the poses from the first result's, or why there are none."""
     results = [session.result for session in sessions]
-    trajectories = [r.trajectory for r in results if r is not None]
+    trajectories = [se3.translation(r.shift) @ r.trajectory for r in results if r is not None]
     if len(trajectories) < len(results) or len({len(t) for t in trajectories}) > 1:
         return "poses are not compared: the results have different numbers of frames"
     finite = np.isfinite(np.stack(trajectories)).all((0, 2, 3))

@@ -119,25 +119,32 @@ def hand_eye(a: Track, b: Track, time_offset_s: float, *, common_world: bool = F
     return _Fit(a, b, X, Y, time_offset_s).solve(common_world=common_world)
 
 
-def combined(a: HandEye, b: HandEye) -> HandEye:
-    """Return the weighted mean of two estimates, with a scaled covariance if they disagree.
+def combined(free: HandEye, common: HandEye, systematic: Float64) -> HandEye:
+    """Return the weighted mean of two fits of the same poses, without and with a common world.
 
-    The covariance is scaled by the Birge ratio (Birge, 1932).
+    The common world only adds information. So the random errors of its fit are in the other one,
+    too, and what that has beyond is independent of them (Hausman, 1978): the difference tells of
+    the systematic errors. The covariance is scaled by the Birge ratio (Birge, 1932) if the fits
+    disagree by more than the covariances of both.
+
+    Parameters
+    ----------
+    free, common
+        Without and with a common world.
+    systematic
+        (6, 6) covariance of the errors of `common` by a deformed world.
     """
-    difference = se3.log(se3.inverse(a.T_a_b) @ b.T_a_b)
-    total = a.covariance + b.covariance
+    difference = se3.log(se3.inverse(common.T_a_b) @ free.T_a_b)
+    values, vectors = np.linalg.eigh(free.covariance - common.covariance)
+    beyond = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    gain = systematic @ np.linalg.pinv(beyond + systematic, hermitian=True)
+    total = free.covariance + common.covariance + systematic
     ratio = float(difference @ np.linalg.pinv(total, hermitian=True) @ difference) / len(difference)
-    gain = a.covariance @ np.linalg.pinv(total, hermitian=True)
-    C = a.covariance - gain @ a.covariance
-    variances = np.array([a.time_sigma_s**2, b.time_sigma_s**2]) + 1e-18
-    information = float((1 / variances).sum())
-    offset = (a.time_offset_s / variances[0] + b.time_offset_s / variances[1]) / information
+    C = common.covariance + systematic - gain @ systematic
     return replace(
-        b,
-        T_a_b=np.asarray(se3.orthonormalise(a.T_a_b @ se3.exp(gain @ difference)), np.float64),
+        common,
+        T_a_b=np.asarray(se3.orthonormalise(common.T_a_b @ se3.exp(gain @ difference)), np.float64),
         covariance=np.asarray(0.5 * (C + C.T) * max(ratio, 1.0), np.float64),
-        time_offset_s=float(offset),
-        time_sigma_s=float(information**-0.5),
     )
 
 

@@ -84,10 +84,7 @@ def calibrate_moving(cameras: Sequence[Camera], progress: Progress) -> Calibrati
         fits[k] = hand_eye(refined[0], refined[k], offset)
         if joint.improved:
             common_fit = hand_eye(refined[0], refined[k], offset, common_world=True)
-            systematic = joint.systematic(k, common_fit)
-            fits[k] = combined(
-                fits[k], replace(common_fit, covariance=common_fit.covariance + systematic)
-            )
+            fits[k] = combined(fits[k], common_fit, joint.systematic(k, common_fit))
         reason = _too_uncertain(fits[k], joint.depth)
         if reason:
             reasons[k] = reason

@@ -109,8 +109,10 @@ def _write(file: Any, lib: Any, columns: Mapping[str, NDArray[Any]], *, with_nor
     count = len(columns["cartesianX"])
     referenced = []  # by the buffers, which do not keep their arrays alive
     for key, column in columns.items():
-        low, high = column.min().item(), column.max().item()
+        # Normals and sigma may be unknown, NaN, which is no limit.
+        low, high = np.fmin.reduce(column).item(), np.fmax.reduce(column).item()
         if column.dtype.kind == "f":
+            low, high = np.nan_to_num([low, high], posinf=np.inf, neginf=-np.inf).tolist()
             values: NDArray[Any] = np.ascontiguousarray(column)
             precision = lib.E57_DOUBLE if column.dtype == np.float64 else lib.E57_SINGLE
             node = lib.FloatNode(image, low, precision, low, high)
