@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import made_sessions
-from made_rooms import seen
+from made_rooms import at, seen
 from made_sessions import made_result_of, quick
 from tofuse.apps.cli.program import main
 from tofuse.apps.export.exporting import export
@@ -104,6 +104,25 @@ def test_odometry_that_one_path_rests_on_counts_in_the_map(session_results, tmp_
     found = merge_sessions(sessions, quick_merge(sessions), threads=2)
     (record,) = [p for p in found.diagnostics.priors if p.sensor == "odometry"]
     assert (record.measured, record.used) == (N - 1, N - 1)
+
+
+def test_session_of_a_camera_on_its_side_is_joined(session_results, tmp_path) -> None:
+    on_its_side = se3.pose(se3.so3_exp([0, 0, np.pi / 2]))
+    turned = [at(0.25 * np.sin(0.2 * k), 0.1, 0.15 + 0.05 * k) @ on_its_side for k in range(12)]
+    side = made_sessions.made_result(tmp_path / "side", turned, 4)
+    upright = np.diag([1.0, -1.0, -1.0, 1.0]) @ se3.pose(turned[0][:3, :3])
+    change_run(side, T_up_world=upright.tolist())  # as a phone measures it
+    sessions = read_sessions([session_results["here"], side], 2, Silent())
+    assert [s.roll for s in sessions] == pytest.approx([0, -np.pi / 2], abs=0.1)
+    config = quick_merge(sessions)
+    config = replace(
+        config, search=replace(config.search, roll=merged_config(sessions).search.roll)
+    )
+    found = merge_sessions(sessions, config, threads=2)
+    true = se3.inverse(HERE[0]) @ np.array([*HERE, *turned])
+    assert found.has_pose.all()
+    off = np.linalg.norm(true[:, :3, 3] - found.trajectory[:, :3, 3], axis=1)
+    assert off.max() < 0.02
 
 
 def test_run_json_states_session_of_each_frame(both, session_results) -> None:

@@ -189,11 +189,11 @@ def test_an_error_that_views_leave_open_is_that_of_usual_cameras():
     assert abs(focal) < 0.2 * USUAL
 
 
-@pytest.mark.parametrize(("remaining_m", "alarm"), [(0.004, False), (0.006, True)])
-def test_drift_that_a_usual_focal_length_explains_better_is_no_offset(
-    monkeypatch, remaining_m, alarm
-):
-    """Both close the loop, and the views confirm both: 0.3 % of the focal length, or 5 cm."""
+def tell_of_loop(monkeypatch, remaining_m: float = 0.006, lengths: float = 1.0) -> None:
+    """A focal length 0.3 % off, or an offset of 5 cm, close the loop; the views confirm both.
+
+    With these, `lengths` are multiples of those without.
+    """
     errors, gaps = {kernels.FOCAL: 0.003, kernels.OFFSET: 0.05}, {0.003: remaining_m, 0.05: 0.005}
 
     class ToldLoop(Loop):
@@ -207,17 +207,37 @@ def test_drift_that_a_usual_focal_length_explains_better_is_no_offset(
             return Gap(0, 11, (before, 0.0), (gaps.get(after, before), 0.0), 1.5)
 
         def estimate_by_views(self, steps, error_index, error):
-            return SimpleNamespace(errors={error_index: error})
+            poses = self.of.refined.poses[self.i : self.j + 1].copy()
+            poses[:, :3, 3] *= lengths
+            return SimpleNamespace(errors={error_index: error}, poses=poses)
 
     monkeypatch.setattr(calibration_check, "Loop", ToldLoop)
     found = SimpleNamespace(covariance=np.full((1, 1), 1e-8))
     told = SimpleNamespace(posterior=lambda sigmas: found)
     linearised = SimpleNamespace(shared_errors=lambda errors: told)
     monkeypatch.setattr(calibration_check, "_linearised", lambda *_: linearised)
+
+
+@pytest.mark.parametrize(("remaining_m", "alarm"), [(0.004, False), (0.006, True)])
+def test_drift_that_a_usual_focal_length_explains_better_is_no_offset(
+    monkeypatch, remaining_m, alarm
+):
+    tell_of_loop(monkeypatch, remaining_m)
     views, refined = kept(0.0)
     found = check_calibration(RefinedViews(views, refined, OPTIONS))
     assert found.alarm == alarm
     assert found.errors == ({"offset": 0.05} if alarm else {})
+
+
+@pytest.mark.parametrize(("lengths", "alarm"), [(1.0, True), (1.3, False)])
+def test_odometry_contradicts_errors_that_close_a_loop(monkeypatch, lengths, alarm):
+    tell_of_loop(monkeypatch, lengths=lengths)
+    views, refined = kept(0.0)
+    runs = [np.arange(3), np.arange(3, 12)]
+    witness = [(run, se3.inverse(refined.poses[run[0]]) @ refined.poses[run]) for run in runs]
+    priors = replace(Priors.none(), witness=witness)
+    assert check_calibration(RefinedViews(views, refined, OPTIONS, priors)).alarm == alarm
+    assert check_calibration(RefinedViews(views, refined, OPTIONS)).alarm
 
 
 def test_few_views_determine_nothing_and_say_what_it_would_do():

@@ -110,6 +110,12 @@ def merged_config(sessions: Sequence[Session]) -> Config:
     odometry = [p for p in sensors if isinstance(p, external_sensors.OdometryEdges)]
     if odometry:  # the least accurate
         priors[external_sensors.OdometryEdges] = max(odometry, key=lambda p: p.scale or 0)
+    # A phone may be upright in one session and on its side in another.
+    rolls = np.exp(1j * np.array([s.roll for s in sessions]))
+    apart = float(np.abs(np.angle(rolls[:, None] / rolls)).max())
+    search = default.search
+    if apart > search.roll:
+        search = replace(search, roll=min(search.roll + apart, np.pi))
     searches = _SEARCHES * (len(sessions) - 1)
     joining = replace(
         default.joining,
@@ -128,6 +134,7 @@ def merged_config(sessions: Sequence[Session]) -> Config:
         tolerance_m=first.tolerance_m,
         priors=tuple(priors.values()) if all(s.config.priors for s in sessions) else (),
         joining=joining,
+        search=search,
         self_calibration=False,  # done for each session
     )
 

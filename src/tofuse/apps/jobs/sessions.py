@@ -9,6 +9,8 @@ from itertools import combinations, count
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
+
 from tofuse.apps.results import folders, reopening, run_json
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
@@ -45,6 +47,8 @@ class Session:
     links
         (i, j) frames in the result, of the loop closures between its sessions; empty for all but
         the first session of a result.
+    roll
+        Mean angle of the camera about its optical axis, rad: 0 if up is at the top of the images.
     """
 
     name: str
@@ -55,6 +59,7 @@ class Session:
     stated: Mapping[int, given.StatedPose]
     stored: reopening.StoredRecording
     links: tuple[tuple[int, int], ...] = ()
+    roll: float = 0.0
 
     @property
     def posed(self) -> dict[int, given.StatedPose]:
@@ -115,11 +120,23 @@ def sessions_of(
         posed = [{k: stated[part.first + k] for k in part.frames} for part in parts]
         links = _links(run, parts)
         odometry_scale = _odometry_scale(run)
+        up = run_json.rotation_up_world(run, folder / "run.json")[1]
     sessions = [
-        _session(part, poses, odometry_scale, folder, threads, progress)
+        replace(
+            _session(part, poses, odometry_scale, folder, threads, progress),
+            roll=_mean_roll(poses.values(), components, up),
+        )
         for part, poses in zip(parts, posed, strict=True)
     ]
     return [replace(sessions[0], links=links), *sessions[1:]]
+
+
+def _mean_roll(stated: Iterable[given.StatedPose], component: int, up: Float64) -> float:
+    """Return the mean roll of the poses in a component, of which `up` (3,) is a direction."""
+    found = [s.T_component_camera for s in stated if s.component == component]
+    poses = np.array([T for T in found if T is not None]).reshape(-1, 4, 4)
+    x, y, _ = np.swapaxes(poses[:, :3, :3], 1, 2).sum(0) @ up
+    return float(np.arctan2(x, -y)) if len(poses) else 0.0
 
 
 def _links(

@@ -362,7 +362,7 @@ def _check_promising(
         spread=estimate.spread,
     )
     if check.is_supported:
-        doubted = estimator.is_contradicted(fit)
+        doubted = _is_contradicted(aligned, estimator.poses, fit.poses)
         gap = loop_gap(aligned, fit.poses, fit.errors)
         check = replace(check, gap=gap, contradicted=doubted and aligned.priors.verified)
         if doubted:  # odometry of unknown errors only prevents an alarm
@@ -391,14 +391,13 @@ class _Estimator:
             pairs=state.pairs,
             scales=refined.scales,
         )
-        self._witness = aligned.priors.witness
         # An estimate of camera errors does not model errors that patches share, so it can't be
         # compared with the refined poses.
-        self._poses = self._align(refined.poses, replace(self._options, rounds=_REALIGNMENT)).poses
+        self.poses = self._align(refined.poses, replace(self._options, rounds=_REALIGNMENT)).poses
 
     def estimate(self) -> AlignedViews:
         """Estimate the errors in full."""
-        first, options, poses = self._first, self._options, self._poses
+        first, options, poses = self._first, self._options, self.poses
         calibrate, errors = list(_INDEX.values()), np.zeros(kernels.ERRORS)
         usual = np.full(kernels.ERRORS, np.inf)
         usual[calibrate] = _sigmas(first.unusual) / np.sqrt(first.prior_weight)
@@ -408,29 +407,35 @@ class _Estimator:
             errors[calibrate], poses = first.found.errors, first.moved
         return self._align(poses, options, calibrate=calibrate, errors=errors, usual=usual)
 
-    def is_contradicted(self, estimate: AlignedViews) -> bool:
-        """Whether poses with the errors of an estimate differ more from odometry, if there is any.
-
-        As of the gap of a loop, only a difference beyond noise counts.
-        """
-        if not self._witness:
-            return False
-        depth = float(np.median([view.depth for view in self._views]))
-        before, after = map(self._from_witness, (self._poses, estimate.poses))
-        return Gap(0, len(self._poses) - 1, before, after, depth).widens
-
-    def _from_witness(self, poses: Float64) -> tuple[float, float]:
-        """Return the rms motion (m, rad) from odometry to poses, of each run of it on its own."""
-        squares = np.zeros(2)
-        for rows, witnessed in self._witness:
-            first = se3.inverse(poses[rows[0]])
-            squares += len(rows) * np.square(rms_motion(witnessed, first @ poses[rows]))
-        m, rad = np.sqrt(squares / sum(len(rows) for rows, _ in self._witness)).tolist()
-        return m, rad
-
     def support_of(self, estimate: AlignedViews) -> tuple[float, float]:
         """Mean support of the views without and with the errors of an estimate."""
-        return mean_support(estimate, self._poses)
+        return mean_support(estimate, self.poses)
+
+
+def _is_contradicted(
+    aligned: RefinedViews, before: Float64, after: Float64, first: int = 0
+) -> bool:
+    """Whether poses (K, 4, 4) differ more from odometry with errors of the camera than without.
+
+    They are of successive views from the `first` on. As of the gap of a loop, only a difference
+    beyond noise counts.
+    """
+    squares, count = np.zeros((2, 2)), 0
+    for positions, witnessed in aligned.priors.witness:
+        inside = (positions >= first) & (positions < first + len(before))
+        if inside.any():
+            rows, of = positions[inside] - first, witnessed[inside]
+            count += len(rows)
+            for k, poses in enumerate((before, after)):
+                motion = rms_motion(
+                    se3.inverse(of[0]) @ of, se3.inverse(poses[rows[0]]) @ poses[rows]
+                )
+                squares[k] += len(rows) * np.square(motion)
+    if not count:
+        return False
+    depth = float(np.median([view.depth for view in aligned.views]))
+    (m, rad), (m_after, rad_after) = np.sqrt(squares / count).tolist()
+    return Gap(first, first + len(before) - 1, (m, rad), (m_after, rad_after), depth).widens
 
 
 def _sigmas(unusual: str) -> Float64:
@@ -469,7 +474,8 @@ def _check_by_loop(aligned: RefinedViews, without_error: CalibrationCheck) -> Ca
     A large error leaves a gap that a refinement may close by matching wrong surfaces. Then its
     residuals reveal nothing. Pairwise alignments from the poses before it don't depend on it. But
     any drift leaves a gap that some error of the camera nearly closes: the views must confirm the
-    error, and no smaller one, as usual cameras have it, may close the gap better.
+    error, odometry must not contradict it, and no smaller one, as usual cameras have it, may close
+    the gap better.
 
     Parameters
     ----------
@@ -494,6 +500,9 @@ def _check_by_loop(aligned: RefinedViews, without_error: CalibrationCheck) -> Ca
         by_views = loop.estimate_by_views(corrected, _INDEX[name], error)
         confirmed = float(by_views.errors[_INDEX[name]])
         if confirmed * error < _MIN_CONFIRMED * error**2:
+            return None
+        without = aligned.refined.poses[loop.i : loop.j + 1]
+        if _is_contradicted(aligned, without, by_views.poses, loop.i):
             return None
         shared = _linearised(by_views, Priors.none()).shared_errors([_INDEX[name]])
         sigma = float(np.sqrt(shared.posterior(np.array([_UNUSUAL])).covariance[0, 0]))
