@@ -224,6 +224,21 @@ def test_a_solid_that_is_inside_out_is_turned(part) -> None:
     assert worst["deviation_m"] > 0.004
 
 
+def test_faces_that_look_the_other_way_are_named(part) -> None:
+    measured = scan(part)
+
+    def warned(reference) -> list[str]:
+        found = compared(measured, reference, searched=False)
+        return [words for words in found.warnings if "other way" in words]
+
+    faces = part.surface.faces.copy()
+    faces[2:4] = faces[2:4, ::-1]  # the top of the plate
+    assert warned(part) == []
+    (words,) = warned(Reference.of(replace(part.surface, faces=faces)))
+    top = (np.abs(measured.points[:, 2] - 0.025) < 0.002) & (measured.normals[:, 2] > 0.9)
+    assert float(words.split(" %")[0]) == pytest.approx(100 * top.mean(), rel=0.1)
+
+
 def test_a_room_faces_inwards(part) -> None:
     """It is closed as a solid is, whose faces would be inside out."""
     room = Reference.of(replace(part.surface, faces=part.surface.faces[:, ::-1]))

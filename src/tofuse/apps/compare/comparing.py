@@ -51,6 +51,8 @@ _NEARER = 0.5  # distance from the guess to a pose, relative to that to a rival 
 _MAX_RIVAL = 0.9  # fraction of the points of a pose that a rival may explain, to be excluded
 _MAX_FITTED = 0.3  # by which a fit changes a symmetry, as a fraction of it
 _NAMED = 0.005  # fraction of a surface from which it is said that it is not compared
+# The same for faces that look the other way, which thin parts have, too.
+_TURNED_NAMED = 0.05
 _SLIDE = 0.02  # along a direction that is not determined, as a fraction of the diagonal
 
 
@@ -369,6 +371,13 @@ def compared(
         for of in (measured, reference.surface)
         if of.left_out > _NAMED
     ]
+    turned = _behind_faces(measured, reference, T, reach)
+    if turned > _TURNED_NAMED:
+        warnings.append(
+            f"{quantities.percent(turned)} of what was measured lies on faces of "
+            f"{reference.surface.name} that look the other way, and has no counterpart: check the "
+            "order of their corners"
+        )
     if not np.isfinite(shared_m):
         reason = reason or "the poses of the result are not bounded in some direction"
     regions = tuple(_regions(deviations, reference, tolerance_m, decided=not reason))
@@ -487,6 +496,18 @@ def _facing_alike(measured: Surface, reference: Reference, T: Float64) -> Refere
     facing = (found.normals * normals).sum(1)[found.compared]
     is_turned = len(facing) > 0 and (facing < 0).mean() > _TURNED_SHARE
     return replace(reference, normals=-reference.normals) if is_turned else reference
+
+
+def _behind_faces(measured: Surface, reference: Reference, T: Float64, reach: Reach) -> float:
+    """Return the fraction of points that only have a counterpart if that may face elsewhere."""
+    chosen = scene.random_subset(len(measured.points), _SYMMETRIC_POINTS)
+    points = se3.transform(T, measured.points[chosen])
+    normals = measured.normals[chosen] @ T[:3, :3].T
+    facing, either = (
+        reference.distances(points, normals, reach, oriented=oriented).compared
+        for oriented in (measured.oriented, False)
+    )
+    return float((either & ~facing).mean())
 
 
 def _is_symmetry(reference: Reference, motion: Float64, *, exact: bool = False) -> bool:
