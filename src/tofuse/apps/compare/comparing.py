@@ -51,8 +51,7 @@ _NEARER = 0.5  # distance from the guess to a pose, relative to that to a rival 
 _MAX_RIVAL = 0.9  # fraction of the points of a pose that a rival may explain, to be excluded
 _MAX_FITTED = 0.3  # by which a fit changes a symmetry, as a fraction of it
 _NAMED = 0.005  # fraction of a surface from which it is said that it is not compared
-# The same for faces that look the other way, which thin parts have, too.
-_TURNED_NAMED = 0.05
+_TURNED_NAMED = 0.05  # the same for faces that point the other way, as those of thin parts may
 _SLIDE = 0.02  # along a direction that is not determined, as a fraction of the diagonal
 
 
@@ -375,8 +374,8 @@ def compared(
     if turned > _TURNED_NAMED:
         warnings.append(
             f"{quantities.percent(turned)} of what was measured lies on faces of "
-            f"{reference.surface.name} that look the other way, and has no counterpart: check the "
-            "order of their corners"
+            f"{reference.surface.name} that point the other way, so it has no counterpart: check "
+            "the winding order of its triangles"
         )
     if not np.isfinite(shared_m):
         reason = reason or "the poses of the result are not bounded in some direction"
@@ -475,10 +474,14 @@ def _explained(measured: Surface, reference: Reference, T: Float64) -> float:
     reference = _facing_alike(measured, reference, T)
     reach = Reach.of(reference, spacing_of(measured.points))
     T, _ = fitted(measured, reference, T, reach, None)
-    chosen = scene.random_subset(len(measured.points), _SYMMETRIC_POINTS)
-    points, normals = se3.transform(T, measured.points[chosen]), measured.normals[chosen]
-    found = reference.distances(points, normals @ T[:3, :3].T, reach, oriented=measured.oriented)
+    found = reference.distances(*_some_at(measured, T), reach, oriented=measured.oriented)
     return float((np.abs(found.signed) < _SYMMETRIC_DISTANCE * reference.diagonal).mean())
+
+
+def _some_at(measured: Surface, T: Float64) -> tuple[Float64, Float64]:
+    """Return a sample of the points (n, 3) and their normals (n, 3), moved by a pose (4, 4)."""
+    chosen = scene.random_subset(len(measured.points), _SYMMETRIC_POINTS)
+    return se3.transform(T, measured.points[chosen]), measured.normals[chosen] @ T[:3, :3].T
 
 
 def _facing_alike(measured: Surface, reference: Reference, T: Float64) -> Reference:
@@ -488,9 +491,7 @@ def _facing_alike(measured: Surface, reference: Reference, T: Float64) -> Refere
     """
     if not (measured.oriented and reference.surface.oriented):
         return reference
-    chosen = scene.random_subset(len(measured.points), _SYMMETRIC_POINTS)
-    points, normals = se3.transform(T, measured.points[chosen]), measured.normals[chosen]
-    normals = normals @ T[:3, :3].T
+    points, normals = _some_at(measured, T)
     reach = Reach.of(reference, spacing_of(measured.points))
     found = reference.distances(points, normals, reach, oriented=False)
     facing = (found.normals * normals).sum(1)[found.compared]
@@ -499,10 +500,8 @@ def _facing_alike(measured: Surface, reference: Reference, T: Float64) -> Refere
 
 
 def _behind_faces(measured: Surface, reference: Reference, T: Float64, reach: Reach) -> float:
-    """Return the fraction of points that only have a counterpart if that may face elsewhere."""
-    chosen = scene.random_subset(len(measured.points), _SYMMETRIC_POINTS)
-    points = se3.transform(T, measured.points[chosen])
-    normals = measured.normals[chosen] @ T[:3, :3].T
+    """Return the fraction of the points whose only counterpart faces the other way."""
+    points, normals = _some_at(measured, T)
     facing, either = (
         reference.distances(points, normals, reach, oriented=oriented).compared
         for oriented in (measured.oriented, False)

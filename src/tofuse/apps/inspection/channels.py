@@ -54,11 +54,11 @@ def check_mirrored(sample: Sample) -> Iterator[Finding]:
     """Check that edges of depth and amplitude (else colour) do not match better if mirrored."""
     for name, channel_of in (("amplitude", _amplitude), ("colour", _grey)):
         # Without the outline of what has a depth, which is no edge of depth.
-        depicted = [f for f in _shiftable(sample.images) if channel_of(f) is not None]
+        depicted = [
+            (f, image) for f in _shiftable(sample.images) if (image := channel_of(f)) is not None
+        ]
         images = [
-            (_oriented_edges(_log_depth(f)), _filled(image, f.valid))
-            for f in depicted
-            if (image := channel_of(f)) is not None
+            (_oriented_edges(_log_depth(f)), _filled(image, f.valid)) for f, image in depicted
         ]
         if len(images) < _MIN_FRAMES:
             continue
@@ -76,7 +76,7 @@ def check_mirrored(sample: Sample) -> Iterator[Finding]:
         turn = _ORIENTATIONS[orientation]
         symmetry = [
             (depth, _oriented_edges(turn(_log_depth(f))))
-            for (depth, _), f in zip(images, depicted, strict=True)
+            for (depth, _), (f, _) in zip(images, depicted, strict=True)
         ]
         if _correlations(symmetry, 0).mean() > _MAX_SYMMETRY:
             continue
