@@ -53,7 +53,7 @@ class Advice:
     T_world_camera
         (4, 4) pose to take; None if there is nothing to advise.
     frame
-        The earlier frame that has been nearest to it; None for a turn.
+        The earlier frame that was nearest to it; None for a turn.
     gaps
         Frames before and after those whose motion no measurement bounds.
     """

@@ -99,7 +99,7 @@ class Comparison:
     Attributes
     ----------
     verdict
-        Of all that was seen; see `Region`. None without a tolerance.
+        Of all that was seen: "pass", "fail" or "undecided"; None without a tolerance.
     tolerance_m
         Largest deviation allowed, to either side, m; None for none.
     regions

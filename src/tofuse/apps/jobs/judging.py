@@ -177,9 +177,9 @@ def judge(
     recording
         Range images, as of `tofuse.open`, or their path.
     trajectory
-        A file of any format of `poses.trajectory_formats`, a result or its folder, a recording with
-        poses, or (N, 4, 4) T_world_camera of the frames, NaN where there is none. Timed poses are
-        assigned to the nearest frames in time, within 20 ms.
+        A file in any supported format, a result or its folder, a recording with poses, or (N, 4, 4)
+        T_world_camera of the frames, NaN where there is none. Timed poses are assigned to the
+        nearest frames in time, within 20 ms.
     tolerance_m
         Accuracy required of good poses, m; see `Config`.
     scale

@@ -42,13 +42,12 @@ def register(
     """Register two views, clouds, meshes or results.
 
     The views are first aligned from the guess. If their agreement makes that pose practically
-    certain, it is returned, within milliseconds for images. Else poses are searched; the best one
-    is aligned and evaluated by the agreement of both views and by its lead over the best rival. Two
-    images, and clouds detected to be seen from their origin, are searched exhaustively
-    (`search.search`: rotations up to 63 degrees about the vertical and 52 about any axis,
-    translations up to 0.6 of the median depth). Clouds are also registered by feature matching
-    (`clouds.fpfh`), under any rotation; without a guess in any case, as a symmetric body fits
-    as well in another pose.
+    certain, it is returned, within milliseconds for images. Otherwise poses are searched; the best
+    one is aligned, and evaluated by the agreement of both views and by its lead over the best other
+    pose. Two images, and clouds detected to be seen from their origin, are searched exhaustively:
+    rotations up to 63 degrees about the vertical and 52 about any axis, translations up to 0.6 of
+    the median depth. Clouds are also registered by feature matching (FPFH) under any rotation;
+    without a guess always, as a symmetric body fits as well in another pose.
 
     Parameters
     ----------
@@ -63,10 +62,10 @@ def register(
     method
         Registration method, or the name of one ("icp", "coarse-to-fine"); the above unless given.
     scale
-        Whether the source is of unknown scale, as models from images alone are. Then `scale` is the
-        factor of its points before `T_target_source` is applied, between a fourth and four times
-        that of equal extents, and `scale_sigma` its standard deviation; seconds. Or that factor, if
-        it is known, such as 0.001 for a source in mm.
+        Whether the source is of unknown scale, as models from images alone are. The `scale` of the
+        result is then the factor of its points before `T_target_source` is applied, between a
+        fourth and four times that of equal extents, and `scale_sigma` its standard deviation; this
+        takes seconds. Or that factor, if it is known, such as 0.001 for a source in mm.
     risk
         Largest probability, up to 0.1, that a `believed` pose is wrong. As most are nearly
         certain, a hundredth of all is expected to be wrong with 0.1.

@@ -44,20 +44,20 @@ class Registration:
     errors
         E at every iteration.
     margin
-        Score of the pose minus that of its best rival, as a fraction of the points, for methods
-        that search; None for those that follow a guess.
+        Score of the pose minus that of the best other pose, as a fraction of the points, for
+        methods that search; None for those that follow a guess.
     believed
         Whether the pose is verified; None for methods that don't verify. `converged` does not imply
         it: iterations converge at wrong poses too.
     probability
-        That the pose is right, 0 to 1, see `search.pose_probability`; None for methods that
-        don't estimate it.
+        That the pose is right, 0 to 1; None for methods that don't estimate it.
     reason
         Why the pose is rejected, in words; empty otherwise.
     remedy
         What would decide whether a rejected pose is right, in words; empty otherwise.
     runner_up
-        (4, 4) T_target_source of the best rival; None if there is none, or none was searched for.
+        (4, 4) T_target_source of the best other pose; None if there is none, or none was searched
+        for.
     overlap, support
         Fraction of the points of both views that project onto a surface of the other one, and that
         lie on it, 0 to 1; None for methods that don't compare views in both directions.

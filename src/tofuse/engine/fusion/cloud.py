@@ -65,7 +65,7 @@ class Cloud(Exportable):
         return f"Cloud: {quantities.count(len(self), 'point')} over {self.diagonal_m:.3g} m"
 
     def record(self) -> GeometryRecord:
-        """See `Exportable.record`."""
+        """Return points in the world frame, with the other columns of a file."""
         scalars = {"views": self.views} | ({} if self.sigma is None else {"sigma": self.sigma})
         return GeometryRecord(self.points, normals=self.normals, color=self.color, scalars=scalars)
 

@@ -159,7 +159,7 @@ class Mesh(Exportable):
         return f"Mesh: {len(self):,} vertices, {len(self.faces):,} faces"
 
     def record(self) -> GeometryRecord:
-        """See `Exportable.record`."""
+        """Return points in the world frame, with the other columns of a file."""
         scalars = {"views": self.views, "sigma": self.sigma}
         return GeometryRecord(self.vertices, self.faces, self.normals, self.color, scalars=scalars)
 

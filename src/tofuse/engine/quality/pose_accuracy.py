@@ -95,8 +95,9 @@ class Accuracy:
     by_motion
         Those between bounded ones, whose pose would be unbounded if the speed were.
     causes_m
-        Rms error of the positions by its cause, see `ObservedErrors.mean_squares`; empty if they
-        are not bounded.
+        Rms error of the positions by its cause: "noise", correction by the "refinement",
+        "disagreement" of views far apart in time, "calibration" of the camera, errors of the
+        "range" that differ from place to place; empty if they are not bounded.
     degrees
         Degrees of freedom of the mean square of the positions as an estimate.
     camera_sigmas

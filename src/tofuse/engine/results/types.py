@@ -29,7 +29,7 @@ class Reason:
     Attributes
     ----------
     code
-        From the closed list in `verdict.REASONS`.
+        From the closed list `REASONS` of `tofuse.engine.results.verdicts`.
     ranges
         (first, last) frame index of each range that it concerns, ascending; at least one.
     text
