@@ -15,6 +15,8 @@ import reference
 ROOT = Path(__file__).resolve().parents[1]
 # Documents in the root of the project become pages of the site too.
 ROOT_PAGES = ("ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")
+# Bars of norms: MathML spaces them as relations.
+_BAR = ">&#x0007C;</mo>"
 _CODE = re.compile(r"(^```.*?^```|`[^`\n]+`)", re.MULTILINE | re.DOTALL)
 
 
@@ -39,12 +41,14 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 def _text(text: str) -> str:
     text = text.replace("](../README.md", "](index.md").replace("](../", "](")
-    text = re.sub(
-        r"\$\$(.+?)\$\$", lambda m: convert(m[1].strip(), display="block"), text, flags=re.DOTALL
-    )
+    text = re.sub(r"\$\$(.+?)\$\$", lambda m: _mathml(m[1].strip(), "block"), text, flags=re.DOTALL)
     return re.sub(r"\$([^$\s](?:[^$\n]*[^$\s])?)\$", _inline, text)
 
 
 def _inline(found: re.Match[str]) -> str:
     # In a span, as Markdown takes an element that it does not know for a block.
-    return f"<span>{convert(found[1])}</span>"
+    return f"<span>{_mathml(found[1], 'inline')}</span>"
+
+
+def _mathml(tex: str, display: str) -> str:
+    return convert(tex, display=display).replace(_BAR, f' lspace="0" rspace="0"{_BAR}')
