@@ -154,10 +154,13 @@ def lines(exhibit: Exhibit, result: Path, truth: Path) -> Iterator[str]:
     yield f"### {exhibit.title}\n"
     yield f"![{exhibit.title}, seen from above]({exhibit.name}.png)\n"
     yield f"{exhibit.caption}\n"
+    measured = (
+        f"; error against the ground truth {1000 * error.ate_rms_m:.1f} mm and"
+        f" {np.degrees(error.rotation_rms_rad):.2f} degrees"
+    )
     yield (
         f"Verdict: **{run_json['verdict']}**; {posed} of {len(run_json['frames'])} frames have a"
-        f" pose; error against the ground truth {1000 * error.ate_rms_m:.1f} mm and"
-        f" {np.degrees(error.rotation_rms_rad):.2f} degrees."
+        f" pose{measured if posed > 1 else ''}."
     )
     reasons = [r for r in run_json["reasons"] if REASONS[r["code"]][0] != "note"]
     if reasons:
