@@ -9,6 +9,7 @@ import pytest
 
 import tofuse
 from pose_errors import pose_error
+from ray_casting import to_room
 from registration_scenes import box_walls, bumpy_ball, rng, turn
 from scanned_flat import scanned
 from tofuse.engine.alignment.base import Registration
@@ -607,3 +608,34 @@ def test_pose_contradicted_by_assumed_free_space_is_not_accepted(monkeypatch) ->
     assert not chosen.believed
     assert chosen.probability < ACCEPTED
     assert "its free space contradicts it" in chosen.reason
+
+
+def two_rooms(at, heading, seed):
+    """A scan, and its pose, of two rooms; there is a narrow door in the wall of 0.15 m between."""
+    wall = [[-0.075, -2, 0], [0.075, 0.4, 2.7]], [[-0.075, 0.8, 0], [0.075, 2, 2.7]]
+    boxes = [
+        [[-3.9, -1.9, 0], [-2.6, -1.2, 0.8]],
+        [[-1.8, 1.4, 0], [-0.9, 2.0, 1.9]],
+        [[-0.5, -1.6, 0], [-0.075, -0.4, 1.2]],
+        [[1.5, 1.3, 0], [2.9, 2.0, 0.5]],
+        [[3.2, -1.9, 0], [4.4, -1.3, 2.0]],
+        [[0.075, -1.9, 0], [0.6, -0.9, 0.7]],
+    ]
+    up, around = np.meshgrid(
+        np.linspace(-1.0, 1.4, 160), np.linspace(-np.pi, np.pi, 400, False), indexing="ij"
+    )
+    rays = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], -1)
+    rays = rays.reshape(-1, 3)
+    T = se3.exp([0, 0, 0, 0, 0, heading])
+    T[:3, 3] = at
+    room = np.array([[-4.0, -2.0, 0.0], [4.6, 2.0, 2.7]])
+    distance, _ = to_room(T[:3, 3], rays @ T[:3, :3].T, room, [*wall, *boxes])
+    distance += np.random.default_rng(seed).normal(0, 0.002, len(distance))
+    return T, (rays * distance[:, None]).astype(np.float32)
+
+
+def test_two_sides_of_a_wall_are_not_laid_together():
+    (T_a, a), (T_b, b) = two_rooms([-2.2, -0.6, 1.5], 0.4, 0), two_rooms([2.4, -0.6, 1.5], 2.0, 1)
+    true = se3.inverse(T_a) @ T_b
+    error = se3.inverse(true) @ tofuse.register(b, a, guess=true).T_target_source
+    assert np.linalg.norm(error[:3, 3]) < 0.01

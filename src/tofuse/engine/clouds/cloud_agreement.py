@@ -137,6 +137,14 @@ def _tested_points(view: CloudFrame, shape: surface_shape.Shape, viewpoint: Floa
     return points[selected[:: max(1, -(-len(selected) // _FREE_SPACE_POINTS))]]
 
 
+def are_oriented(source: CloudMap, target: CloudMap) -> bool:
+    """Whether the normals of both point to where they were seen from, so that sides are known.
+
+    From two rooms either side of the wall between them is seen. These must not be laid together.
+    """
+    return all(m.viewpoint is not None and not m.viewpoint.fused for m in (source, target))
+
+
 def tolerance(source: CloudMap, target: CloudMap) -> float:
     """Return the distance in m within which surfaces of two views coincide."""
     noise = float(np.hypot(source.sigma, target.sigma))
@@ -190,7 +198,9 @@ def _one_direction(
     if not len(points):
         return (0.0,) * 6
     points, normals = se3.transform(T, points), normals @ T[:3, :3].T
-    is_near, distance, same_normal = _surface_at(other, points, normals, max(view.size, other.size))
+    is_near, distance, same_normal = _surface_at(
+        other, points, normals, max(view.size, other.size), signed=are_oriented(view, other)
+    )
     on_surface = is_near & same_normal & (distance < max_distance)
     violation = _in_free_space(view, other, T, max_distance)
     return (
@@ -215,20 +225,24 @@ def _in_free_space(view: CloudMap, other: CloudMap, T: Float64, max_distance: fl
 
 
 def _surface_at(
-    view: CloudMap, points: Float64, normals: Float64 | None, resolution: float
+    view: CloudMap,
+    points: Float64,
+    normals: Float64 | None,
+    resolution: float,
+    *,
+    signed: bool = False,
 ) -> tuple[Bool, Float64, Bool]:
     """Return whether points (n, 3) are near a surface, and their distance (n,) from its plane.
 
-    The third result is whether their normals (n, 3), if given, agree with those of the surface.
+    The third result is whether their normals (n, 3), if given, agree with those of the surface, if
+    `signed` also on the side that is seen.
     """
     nearest, _ = view.tree.nearest(points, _MAX_DISTANCE * resolution)
     is_near = nearest >= 0
     surface_normals = view.normals[np.maximum(nearest, 0)]
     surface_points = view.view.points[np.maximum(nearest, 0)].astype(np.float64)
     distance = np.abs(((points - surface_points) * surface_normals).sum(1))
-    same_normal = (
-        is_near
-        if normals is None
-        else np.abs((normals * surface_normals).sum(1)) > _MIN_NORMAL_COSINE
-    )
-    return is_near, distance, same_normal
+    if normals is None:
+        return is_near, distance, is_near
+    cosine = (normals * surface_normals).sum(1)
+    return is_near, distance, (cosine if signed else np.abs(cosine)) > _MIN_NORMAL_COSINE

@@ -24,6 +24,7 @@ from tofuse.engine.clouds.cloud_agreement import (
     NEIGHBOURS,
     CloudAgreement,
     CloudMap,
+    are_oriented,
     cloud_agreement,
 )
 from tofuse.engine.clouds.cloud_uncertainty import cloud_information, cloud_unobservable
@@ -158,6 +159,31 @@ class _CloudViews:
         )
         return replace(self, source_map=source, target_map=target)
 
+    @property
+    def coarse_to_fine(self) -> CoarseToFine:
+        """ICP with all points, of surfaces seen from the same side if their sides are known."""
+        sided = are_oriented(self.source_map, self.target_map)
+        return CoarseToFine(rejectors=(icp_parts.SameSide(),) if sided else ())
+
+    @property
+    def _refinement_stages(self) -> tuple[Icp, ...]:
+        """ICP with few iterations, first with a wide reach, then with a narrow one."""
+        sided = self.coarse_to_fine.rejectors
+        wide = Icp(
+            self.size,
+            source=icp_parts.Uniform(_REFINED_POINTS),
+            target=icp_parts.All(),
+            rejectors=(icp_parts.MaxDistance(4.0), *sided),
+            metric=surface_metrics.PointToPlane(loss="tukey"),
+            stopping=icp_parts.SmallStep(1e-2, 8),
+            neighbours=NEIGHBOURS,
+        )
+        return wide, replace(
+            wide,
+            rejectors=(icp_parts.MaxDistance(2.0), *sided),
+            stopping=icp_parts.SmallStep(1e-3, 8),
+        )
+
     def evaluated(self, T: Float64) -> _Pose:
         return _Pose(T, cloud_agreement(self.source_map, self.target_map, T))
 
@@ -168,7 +194,7 @@ class _CloudViews:
         """
         initial = self.evaluated(T)
         try:
-            for icp in _refinement_stages(self.size)[settled:]:
+            for icp in self._refinement_stages[settled:]:
                 T = icp.register(
                     self.source_map.view, self.target_map.view, T, self.rng
                 ).T_target_source
@@ -439,7 +465,7 @@ def follow_clouds(
     views = _CloudViews.of(source, target, rng)
     local = replace(views.refined(guess), guess=guess)
     if views.evidence(local).probability < pose_probability.CERTAIN:
-        coarse = CoarseToFine().register(source, target, guess, rng)
+        coarse = views.coarse_to_fine.register(source, target, guess, rng)
         alternative = replace(views.evaluated(coarse.T_target_source), guess=guess)
         local = max(local, alternative, key=lambda pose: pose.agreement.score)
     return views.with_information(replace(_registration(views, local), given_guess=True))
@@ -466,7 +492,7 @@ def _proposed(
     if supported or (poses and not guessed):
         return poses, found
     try:
-        registration = CoarseToFine().register(views.source, views.target, start, views.rng)
+        registration = views.coarse_to_fine.register(views.source, views.target, start, views.rng)
         poses.append(replace(views.evaluated(registration.T_target_source), guess=start))
     except RegistrationError as error:
         failure = error
@@ -587,22 +613,6 @@ def _pose_distance(a: Float64, b: Float64) -> float:
     return float(np.linalg.norm(se3.log(se3.inverse(a) @ b)))
 
 
-def _refinement_stages(size: float) -> tuple[Icp, ...]:
-    """Return ICP with few iterations, first with a wide reach, then with a narrow one."""
-    wide = Icp(
-        size,
-        source=icp_parts.Uniform(_REFINED_POINTS),
-        target=icp_parts.All(),
-        rejectors=(icp_parts.MaxDistance(4.0),),
-        metric=surface_metrics.PointToPlane(loss="tukey"),
-        stopping=icp_parts.SmallStep(1e-2, 8),
-        neighbours=NEIGHBOURS,
-    )
-    return wide, replace(
-        wide, rejectors=(icp_parts.MaxDistance(2.0),), stopping=icp_parts.SmallStep(1e-3, 8)
-    )
-
-
 def _rival(views: _CloudViews, poses: Sequence[_Pose], best: _Pose, aligned: _Pose) -> _Pose:
     """Return the first pose distinct from the best one, which was `aligned` with all points.
 
@@ -617,7 +627,9 @@ def _rival(views: _CloudViews, poses: Sequence[_Pose], best: _Pose, aligned: _Po
         if aligned.agreement.score - pose.agreement.score >= pose_probability.MIN_LEAD:
             return pose
         try:
-            converged = CoarseToFine().approximate_pose(views.size, *averaged, start, _RIVAL_POINTS)
+            converged = views.coarse_to_fine.approximate_pose(
+                views.size, *averaged, start, _RIVAL_POINTS
+            )
         except RegistrationError:
             converged = start
         if views.are_distinct_poses(converged, aligned.T_target_source):
@@ -634,7 +646,7 @@ def _registration(
     """
     T = best.T_target_source
     averaged = views.source_map.view, views.target_map.view
-    registration = CoarseToFine().at(
+    registration = views.coarse_to_fine.at(
         views.size, *averaged, T, T if best.guess is None else best.guess
     )
     pose = views.evaluated(registration.T_target_source)

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.clouds.cloud_agreement import NEIGHBOURS, CloudMap
+from tofuse.engine.clouds.cloud_agreement import NEIGHBOURS, CloudMap, are_oriented
 from tofuse.engine.geometry import se3, unit_vectors
 from tofuse.engine.icp import surface_metrics
 from tofuse.engine.normal import robust_sigma
@@ -127,7 +127,8 @@ class _Pairs:
         a, b = target.normals[j] @ R, source.normals[::stride]
         q = se3.transform(se3.inverse(T), target.view.points[j].astype(np.float64))
         cosine = (a * b).sum(1)
-        matched = (nearest >= 0) & (np.abs(cosine) > _MIN_NORMAL_COSINE)  # false for NaN
+        alike = cosine if are_oriented(source, target) else np.abs(cosine)
+        matched = (nearest >= 0) & (alike > _MIN_NORMAL_COSINE)  # false for NaN
         if np.count_nonzero(matched) < surface_metrics.MIN_PAIRS:
             return None
         p, q, a = p[matched], q[matched], a[matched]

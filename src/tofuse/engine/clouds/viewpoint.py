@@ -52,10 +52,14 @@ _NEIGHBOURHOOD = np.ones((3, 3), np.uint8)
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """Sensor position `origin` (3,) in m, and the angular spacing of the points in rad."""
+    """Sensor position `origin` (3,) in m, and the angular spacing of the points in rad.
+
+    That of a cloud that was `fused` from several views is the first of several positions.
+    """
 
     origin: Float64
     spacing: float
+    fused: bool = False
 
 
 # Cache: a view is registered to several others, as an image and as a cloud.
@@ -131,7 +135,8 @@ def _fused(view: CloudFrame) -> Viewpoint | None:
     others = [_hidden_fraction(points - place, spread) for place in places]
     if hidden > min(_MAX_HIDDEN, float(np.percentile(others, _PLACES_PERCENTILE))):
         return None
-    return Viewpoint(origin, spread / 2 / max(float(np.median(ranges)), spread))
+    angle = spread / 2 / max(float(np.median(ranges)), spread)
+    return Viewpoint(origin, angle, fused=True)
 
 
 def _hidden_fraction(points: Float64, size: float) -> float:

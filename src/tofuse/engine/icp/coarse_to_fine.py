@@ -18,7 +18,7 @@ from tofuse.engine.frames import CloudFrame, Frame
 from tofuse.engine.geometry import KdTree, se3
 from tofuse.engine.icp.icp import Icp, Remapping
 from tofuse.engine.icp.icp_parts import All, MaxDistance, SmallStep, Uniform
-from tofuse.engine.icp.interfaces import Metric
+from tofuse.engine.icp.interfaces import Metric, Rejector
 from tofuse.engine.icp.surface_metrics import MIN_PAIRS, PlaneToPlane
 from tofuse.engine.icp.surface_shape import shape_at
 from tofuse.engine.parts import part
@@ -67,6 +67,8 @@ class CoarseToFine(Bounded, Registrar):
     coarsest
         Upper limit of the coarsest level's resolution, m, for accurate guesses. None: a tenth of
         the scene.
+    rejectors
+        Drop pairs that are within reach.
     """
 
     resolution: Annotated[float | None, Bounds(0, exclusive=True)] = None
@@ -76,6 +78,7 @@ class CoarseToFine(Bounded, Registrar):
     neighbours: int = 12
     max_iterations: int = 40
     coarsest: Annotated[float | None, Bounds(0, exclusive=True)] = None
+    rejectors: tuple[Rejector, ...] = ()
 
     def register(
         self, source: Frame, target: Frame, guess: Float64, rng: np.random.Generator
@@ -156,7 +159,7 @@ class CoarseToFine(Bounded, Registrar):
             resolution,
             source=All(),
             target=All(),
-            rejectors=(MaxDistance(self.reach),),
+            rejectors=(MaxDistance(self.reach), *self.rejectors),
             metric=self.metric,
             stopping=SmallStep(epsilon, self.max_iterations),
             neighbours=self.neighbours,

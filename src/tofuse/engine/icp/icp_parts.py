@@ -134,6 +134,23 @@ class MaxDistance(Bounded, interfaces.Rejector):
         return matches.keep(matches.distance <= self.reach(alignment.resolution))
 
 
+@part("rejector", "same-side")
+@dataclass(frozen=True)
+class SameSide(interfaces.Rejector):
+    """Drops pairs whose normals point to opposite sides, as those of the two sides of a wall.
+
+    Only for views that were seen from their origins.
+    """
+
+    def reject(
+        self, matches: interfaces.Matches, alignment: interfaces.Alignment
+    ) -> interfaces.Matches:
+        """See `Rejector.reject`."""
+        normals = alignment.source.normals[matches.source] @ alignment.T_target_source[:3, :3].T
+        opposite = (normals * alignment.target.normals[matches.target]).sum(1) < 0
+        return matches.keep(~opposite)
+
+
 @part("rejector", "unique", label="validated")
 @dataclass(frozen=True)
 class Unique(interfaces.Rejector):
