@@ -90,7 +90,8 @@ ADVICE: dict[str, str] = {
     "open_motion": "Record again with less that moves in view, or from farther away.",
     "ambiguous_steps": "Record at a higher frame rate or move more slowly, and keep things that "
     "don't repeat in view.",
-    "uncertain_poses": "Return to places seen before, or keep corners and texture in view.",
+    "uncertain_poses": "By what the error is mostly due to: return to places seen before, keep "
+    "corners and texture in view, or calibrate the camera (tofuse calibrate depth).",
     "calibration_alarm": "Check the camera's calibration against a known distance and a right "
     "angle.",
     "range_changes": "Let the camera warm up and keep its mode; check the unit of all depth files.",
