@@ -15,6 +15,7 @@ from types import ModuleType
 
 import pytest
 
+from cli_calls import printed, refuses
 from paths import BENCHMARKS
 from tofuse.apps.batch import cluster
 from tofuse.apps.cli.program import main
@@ -97,8 +98,7 @@ def test_bad_recording_does_not_stop_batch(room_recording: Path, tmp_path: Path,
     output = capsys.readouterr().err
     assert "none of 1 recordings gave a result; nothing: " in output
     assert output.count("\n") == 1
-    assert main([*words, "--print-jobs"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = printed(capsys, *words, "--print-jobs").splitlines()
     assert [shlex.split(line)[-1] for line in lines] == ["nothing", room_recording.name]
 
     assert main(words) == 3
@@ -155,8 +155,7 @@ def test_unreachable_scheduler_is_reported(
         assert output.startswith(f"tofuse: {address}: no Dask scheduler answers; start one")
         assert output.count("\n") == 1
     words = ["batch", str(listed), "--out", str(tmp_path / "out"), "--scheduler", str(listed)]
-    assert main(words) == 2
-    assert f"{listed}: no Dask scheduler answers" in capsys.readouterr().err
+    refuses(capsys, *words, says=f"{listed}: no Dask scheduler answers")
     assert not (tmp_path / "out").exists()
 
 

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
+from cli_calls import printed, refuses
 from tofuse.apps.calibration import lens
 from tofuse.apps.calibration.board import Board, board_pose, find_corners
 from tofuse.apps.calibration.lens import BoardView, LensFit, calibrate_lens
-from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import Camera, Fisheye, Pinhole, Rational
 from tofuse.engine.errors import InputError, on_command_line
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
@@ -196,10 +196,9 @@ def test_command_writes_camera_for_readers(
     writer.finish()
     out = tmp_path / "new" / "camera.json"
     command = ["calibrate", "lens", str(tmp_path / "rec"), "--board", "8x6:0.1"]
-    assert main([*command, "--out", str(out)]) == 0
-    printed = capsys.readouterr().out
-    assert "fx 2" in printed
-    assert "(sigma " in printed
+    text = printed(capsys, *command, "--out", out)
+    assert "fx 2" in text
+    assert "(sigma " in text
     about = json.loads(out.read_text())
     assert about["depth_unit_m"] == 0.0001
     assert about["amplitude_kind"] == "range_compensated"
@@ -207,7 +206,5 @@ def test_command_writes_camera_for_readers(
     assert isinstance(frame, RangeFrame)
     assert isinstance(frame.camera, Pinhole)
     assert frame.camera.fx == pytest.approx(TRUE.fx, rel=0.005)
-    assert main([*command, "--out", str(out)]) == 2
-    assert "--overwrite" in capsys.readouterr().err
-    assert main(["calibrate", "lens", str(tmp_path / "rec")]) == 2
-    assert "--board" in capsys.readouterr().err
+    refuses(capsys, *command, "--out", out, says="--overwrite")
+    refuses(capsys, "calibrate", "lens", tmp_path / "rec", says="--board")

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cli_calls import printed, refuses
+from refused import refused
 from tofuse.apps.calibration.noise_estimation import estimate_noise
-from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
@@ -172,21 +173,17 @@ def test_noise_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
         writer.add(replace(frame, timestamp=k / 30))
     writer.finish()
     out = tmp_path / "rec" / "noise.json"
-    assert main(["noise", str(tmp_path / "rec"), "--out", str(out), "--name", "mine"]) == 0
-    text = capsys.readouterr().out
+    text = printed(capsys, "noise", tmp_path / "rec", "--out", out, "--name", "mine")
     assert "raw amplitude" in text
     assert "mine, 4 frames in 1 static segment" in text
     recording = open_recording(tmp_path / "rec")
     assert recording.warnings == []
     assert noise_model_for(recording) == read_noise(out)
-    assert main(["noise", str(tmp_path / "rec"), "--out", str(out)]) == 2
-    assert "--overwrite" in capsys.readouterr().err
-    assert main(["noise", str(tmp_path / "rec"), "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
-    assert NoiseModel.from_dict(printed["model"]).amplitude == read_noise(out).amplitude
+    refuses(capsys, "noise", tmp_path / "rec", "--out", out, says="--overwrite")
+    found = json.loads(printed(capsys, "noise", tmp_path / "rec", "--json"))
+    assert NoiseModel.from_dict(found["model"]).amplitude == read_noise(out).amplitude
     out.write_text('{"schema": 1, "name": "x", "range": {"a": 20, "b": 0}}')
-    with pytest.raises(InputError, match="a must be 0 to 5"):
-        open_recording(tmp_path / "rec")
+    refused("a must be 0 to 5", tmp_path / "rec")
 
 
 @pytest.mark.parametrize("gain", [0.01, 30.0])

@@ -12,8 +12,10 @@ import pytest
 
 import made_arrays
 from camera_files import MAKERS
+from cli_calls import printed
 from damaged_files import make_native, make_ply
 from made_recordings import make_sr4000
+from refused import refused
 from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.errors import InputError, OutputError
@@ -101,8 +103,7 @@ def test_rays_of_each_frame(tmp_path: Path) -> None:
     assert isinstance(after[1].camera, RayTable)
     assert not np.array_equal(after[0].camera.rays(), after[1].camera.rays())
     (tmp_path / "out" / "rays" / "000001.npy").unlink()
-    with pytest.raises(InputError, match="rays: has 2 images"):
-        open_recording(tmp_path / "out")
+    refused("rays: has 2 images", tmp_path / "out")
 
 
 def test_correction_is_kept_with_raw_measurements(tmp_path: Path) -> None:
@@ -154,8 +155,7 @@ def test_convert_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     path = tmp_path / "scan" / "depth_0001.png"
     path.write_bytes(path.read_bytes()[:60])
     words = ["convert", str(tmp_path / "scan"), "--out", str(tmp_path / "out")]
-    assert main(words) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = printed(capsys, *words).splitlines()
     assert lines[0] == f"2 frames in {tmp_path / 'out'}"
     assert any("depth_0001.png" in line for line in lines[1:])
     assert main(words) == 2

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from cli_calls import refuses
 from posed_results import DISTANCE, NORMAL, POSED, POSES, made_result, plane
 from tofuse.apps.cli.program import main
 from tofuse.apps.export import exporting
@@ -269,10 +270,8 @@ def test_missing_package_is_named_before_any_work(
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.setattr(exporting, "_Result", None)
-    assert main(["export", str(result), "pcd", name]) == 2
-    assert f"export {name}: needs the package {package}; pip install {extra}" in (
-        capsys.readouterr().err
-    )
+    says = f"export {name}: needs the package {package}; pip install {extra}"
+    refuses(capsys, "export", result, "pcd", name, says=says)
 
 
 def test_command_writes_grids_that_belong_to_the_result(

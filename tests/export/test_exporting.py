@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from cli_calls import printed, refuses
 from parsed_glb import parse
 from tofuse.apps.cli.options import Export
 from tofuse.apps.cli.program import main
@@ -258,29 +259,25 @@ def test_kitti(result: Path) -> None:
 def test_export_command(result: Path, tmp_path: Path, capsys) -> None:
     assert ", ".join(FORMATS) in " ".join((Export.__doc__ or "").split())
     out = tmp_path / "new" / "files"
-    assert main(["export", str(result), "las", "kitti", "--out", str(out)]) == 0
-    assert capsys.readouterr().out.split() == [
+    assert printed(capsys, "export", result, "las", "kitti", "--out", out).split() == [
         str(out / "cloud.las"),
         str(out / "trajectory.kitti.txt"),
     ]
     before = (out / "cloud.las").read_bytes()
     (out / "cloud.las").write_bytes(b"mine")
-    assert main(["export", str(result), "las", "--out", str(out)]) == 2
-    assert "--overwrite" in capsys.readouterr().err
+    refuses(capsys, "export", result, "las", "--out", out, says="--overwrite")
     assert main(["export", str(result), "las", "--out", str(out), "--overwrite"]) == 0
     assert (out / "cloud.las").read_bytes() == before
     (result / "mesh.ply").unlink()
     (out / "mine.txt").write_text("mine")
     kept = sorted(out.iterdir())
     for folder in (tmp_path / "fresh", out):  # the cloud comes first
-        assert main(["export", str(result), "pcd", "log", "stl", "--out", str(folder)]) == 2
-        assert "mesh.ply: doesn't exist" in capsys.readouterr().err
+        words = ("export", result, "pcd", "log", "stl", "--out", folder)
+        refuses(capsys, *words, says="mesh.ply: doesn't exist")
     assert not (tmp_path / "fresh").exists()
     assert sorted(out.iterdir()) == kept
-    assert main(["export", str(tmp_path), "las"]) == 2
-    assert "is not a result" in capsys.readouterr().err
-    assert main(["export", str(result), "doc"]) == 2
-    assert "use one of" in capsys.readouterr().err
+    refuses(capsys, "export", tmp_path, "las", says="is not a result")
+    refuses(capsys, "export", result, "doc", says="use one of")
 
 
 def test_only_one_process_writes_to_a_result(result: Path, tmp_path: Path) -> None:

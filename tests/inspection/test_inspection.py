@@ -14,8 +14,8 @@ import pytest
 
 import made_rooms
 import tofuse
+from cli_calls import printed
 from ray_casting import rays_at, to_room, to_walls
-from tofuse.apps.cli.program import main
 from tofuse.apps.inspection.channels import (
     _correlations,
     _delay,
@@ -160,12 +160,10 @@ def test_unreadable_frames_give_warning(copy) -> None:
 
 def test_warnings_of_the_reader_are_reported(tmp_path, capsys) -> None:
     folder = written(tmp_path / "rec", [image(2.0), image(2.0, 1)], **{"colour[x]": "grey"})
-    assert main(["inspect", str(folder), "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
+    data = json.loads(printed(capsys, "inspect", folder, "--json"))
     assert set(data) == {"facts", "findings", "warnings"}
     assert any("colour[x]" in w for w in data["warnings"])
-    assert main(["inspect", str(folder)]) == 0
-    reported = capsys.readouterr().out
+    reported = printed(capsys, "inspect", folder)
     assert "colour[x]" in reported  # brackets are not interpreted as markup
     assert "\\" not in reported
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import tofuse
-from tofuse.apps.cli.program import main
+from cli_calls import printed, refuses
 from tofuse.apps.jobs.judging import poses_for, sentence
 from tofuse.apps.jobs.pose_scale import with_scale
 from tofuse.apps.results.folders import RESULT
@@ -254,8 +254,7 @@ def test_command(room_recording, truth, tmp_path, capsys) -> None:
     poses = tmp_path / "poses.txt"
     write_tum(poses, recording.timestamps, bent(truth))
     words = ["judge", str(room_recording), str(poses), "--out", str(tmp_path / "out")]
-    assert main([*words, "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
+    data = json.loads(printed(capsys, *words, "--json"))
     assert data["verdict"] == "degraded"
     assert data["out"] == str(tmp_path / "out")
     kept = json.loads((tmp_path / "out/judge.json").read_text())
@@ -274,21 +273,18 @@ def test_command(room_recording, truth, tmp_path, capsys) -> None:
     assert len(deviation["frames"]) == len(deviation["of_frames_m"])
     assert deviation["inconsistent_steps"] == [[3, 4]]
     # Its result is replaced only on request, and is a trajectory itself.
-    assert main(words) == 2
-    assert "--overwrite" in capsys.readouterr().err
-    assert main(["judge", str(room_recording), str(tmp_path / "out")]) == 0
-    out = capsys.readouterr().out
+    refuses(capsys, *words, says="--overwrite")
+    out = printed(capsys, "judge", room_recording, tmp_path / "out")
     assert "\nout: ±" in out
     assert "Consistent with the depth to within" in out
     assert "map consistency: given" in out
 
 
 def test_command_refuses(room_recording, tmp_path, capsys) -> None:
-    assert main(["judge", str(room_recording), str(tmp_path / "none.txt")]) == 2
-    assert "none.txt" in capsys.readouterr().err
-    assert main(["judge", str(room_recording), str(room_recording), "--overwrite"]) == 2
-    assert "pass --out" in capsys.readouterr().err
+    refuses(capsys, "judge", room_recording, tmp_path / "none.txt", says="none.txt")
+    refuses(capsys, "judge", room_recording, room_recording, "--overwrite", says="pass --out")
     shutil.copytree(room_recording, tmp_path / "mine")
     poses = str(room_recording / "groundtruth.txt")
-    assert main(["judge", str(room_recording), poses, "--out", str(tmp_path / "mine")]) == 2
-    assert "no earlier result" in capsys.readouterr().err
+    refuses(
+        capsys, "judge", room_recording, poses, "--out", tmp_path / "mine", says="no earlier result"
+    )

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import made_sessions
+from cli_calls import printed, refuses
 from made_rooms import at, seen
 from made_sessions import made_result_of, quick
-from tofuse.apps.cli.program import main
 from tofuse.apps.export.exporting import export
 from tofuse.apps.jobs import merging
 from tofuse.apps.jobs.merging import joined_recording, merge_sessions, merged_config
@@ -196,8 +196,7 @@ def test_command_writes_result(session_results, tmp_path, monkeypatch, capsys) -
         return textured(mesh, views, poses, size // 8)  # a small texture
 
     monkeypatch.setattr(texture, "textured", painting)
-    assert main([*words, "--threads", "2", "--texture"]) == 0
-    assert "here and there overlap" in capsys.readouterr().out
+    assert "here and there overlap" in printed(capsys, *words, "--threads", "2", "--texture")
     assert painted == [2 * N]  # views of both
     assert read_textured_glb(out / "mesh.glb") is not None
     times, poses = read_tum(out / "trajectory.txt")
@@ -208,8 +207,7 @@ def test_command_writes_result(session_results, tmp_path, monkeypatch, capsys) -
     report = (out / "report.html").read_text()
     assert "here, there merged" in report
     assert "Sessions" in report
-    assert main(words) == 2  # holds a result already
-    assert "overwrite" in capsys.readouterr().err
+    refuses(capsys, *words, says="overwrite")
 
 
 def refused(folders, *parts) -> None:

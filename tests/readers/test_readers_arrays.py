@@ -11,6 +11,7 @@ import pytest
 
 import made_arrays as made
 import tofuse
+from refused import refused
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
@@ -78,21 +79,18 @@ def test_npz_with_metres_and_rays(tmp_path: Path) -> None:
 )
 def test_npz_errors_name_the_problem(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     np.savez(tmp_path / "a.npz", **made.arrays(**changes))
-    with pytest.raises(InputError, match=message):
-        open_recording(tmp_path / "a.npz")
+    refused(message, tmp_path / "a.npz")
 
 
 def test_negative_depth_of_a_file_is_named(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", **made.arrays(depth=-0.001 * made.COUNTS))
-    with pytest.raises(InputError, match="holds negative depth only; negate it"):
-        open_recording(tmp_path / "a.npz")
+    refused("holds negative depth only; negate it", tmp_path / "a.npz")
 
 
 def test_npy_alone_says_what_it_lacks(tmp_path: Path) -> None:
     np.save(tmp_path / "depth.npy", made.COUNTS)
     for path in (tmp_path, tmp_path / "depth.npy"):
-        with pytest.raises(InputError, match=r"depth and K by numpy\.savez"):
-            open_recording(path)
+        refused(r"depth and K by numpy\.savez", path)
 
 
 def test_zense(tmp_path: Path) -> None:
@@ -105,8 +103,7 @@ def test_zense(tmp_path: Path) -> None:
     np.testing.assert_allclose(frame.z[1:], made.COUNTS[1, 1:] * 0.001, rtol=1e-6)
     path = tmp_path / "scan" / "camera.toml"
     path.write_text(path.read_text().replace("camera_cy = 5.5", ""))
-    with pytest.raises(InputError, match=r"camera\.toml: camera_cy: is missing; use a number"):
-        open_recording(tmp_path / "scan")
+    refused(r"camera\.toml: camera_cy: is missing; use a number", tmp_path / "scan")
 
 
 def test_real_zense(shared_data: Path) -> None:

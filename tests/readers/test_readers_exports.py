@@ -12,6 +12,7 @@ import pytest
 
 import made_exports as made
 from made_exports import BEHIND_M, CAMERA
+from refused import refused
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
@@ -74,8 +75,7 @@ def test_other_clouds_stay_clouds(tmp_path: Path) -> None:
         recording = open_recording(folder)
         assert recording.format == "ply"
         assert isinstance(recording[0], CloudFrame)
-        with pytest.raises(InputError, match=r"one point per pixel .*format ply"):
-            open_recording(folder, format="grid")
+        refused(r"one point per pixel .*format ply", folder, format="grid")
 
 
 def test_missing_points_leave_others_on_their_pixels(tmp_path: Path) -> None:
@@ -105,10 +105,7 @@ def camera_json(folder: Path, **changes: object) -> Path:
 
 def test_tiff3d_with_camera(tmp_path: Path) -> None:
     made.make_tiff3d(tmp_path / "a")
-    with pytest.raises(
-        InputError, match=r"has no camera: the layout of \.t3c .* use camera=camera\.json"
-    ):
-        open_recording(tmp_path / "a")
+    refused(r"has no camera: the layout of \.t3c .* use camera=camera\.json", tmp_path / "a")
     camera = camera_json(tmp_path, frame_rate_hz=25.0, ambiguity_m=7.5)
     recording = open_recording(tmp_path / "a", camera=camera)
     assert (recording.format, len(recording)) == ("tiff", 3)
@@ -128,16 +125,14 @@ def test_other_tiffs_are_depth_on_request(tmp_path: Path) -> None:
     counts[0, 0] = 65535
     cv2.imwrite(str(folder / "depth_1.tiff"), counts)
     cv2.imwrite(str(folder / "confidence_1.tiff"), counts)
-    with pytest.raises(InputError, match=r"use format tiff and camera=camera\.json"):
-        open_recording(folder)
+    refused(r"use format tiff and camera=camera\.json", folder)
     camera = camera_json(tmp_path, depth_unit_m=1e-4, depth_kind="z")
     frame = open_recording(folder, format="tiff", camera=camera)[0]
     assert frame.amplitude_image is None
     counts[0, 0] = 0
     np.testing.assert_allclose(frame.z, counts * 1e-4, rtol=1e-6)
     small = camera_json(tmp_path, width=16, height=12)
-    with pytest.raises(InputError, match="32 x 24 pixels, the camera 16 x 12"):
-        open_recording(folder, format="tiff", camera=small)
+    refused("32 x 24 pixels, the camera 16 x 12", folder, format="tiff", camera=small)
 
 
 @pytest.mark.parametrize("order", "<>")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import made_kinect as made
+from refused import refused
 from tofuse.engine.cameras.cameras import RayTable
-from tofuse.engine.errors import InputError
 from tofuse.engine.geometry.rays import homogeneous
 from tofuse.formats.cameras.camera_file import ColorCamera
 from tofuse.formats.recordings.open import open_recording
@@ -149,20 +149,15 @@ def test_missing_tracks_and_calibration_are_named(tmp_path: Path) -> None:
     depth = made.small_counts(2)
     path = tmp_path / "a.mkv"
     made.make_mkv(path, depth, infrared=depth, without="DEPTH")
-    with pytest.raises(InputError, match="only infrared"):
-        open_recording(path)
+    refused("only infrared", path)
     made.make_mkv(path, depth, without="calibration")
-    with pytest.raises(
-        InputError, match=r"calibration\.json: is missing; pass .* with camera=camera\.json"
-    ):
-        open_recording(path)
+    refused(r"calibration\.json: is missing; pass .* with camera=camera\.json", path)
     camera = {"schema": 1, "model": "pinhole", "width": 320, "height": 288, "fx": 250, "fy": 250}
     camera |= {"cx": 160, "cy": 144, "depth_unit_m": 0.001, "depth_kind": "z"}
     (tmp_path / "camera.json").write_text(json.dumps(camera))
     assert len(open_recording(path, camera=tmp_path / "camera.json")[0]) > 1000
     made.make_mkv(path, depth[:, :100])
-    with pytest.raises(InputError, match="320 x 100 pixels, of no known mode"):
-        open_recording(path)
+    refused("320 x 100 pixels, of no known mode", path)
 
 
 def test_real_capture(shared_data: Path) -> None:

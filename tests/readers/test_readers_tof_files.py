@@ -11,7 +11,7 @@ import pytest
 import made_tof
 from made_phones import DEPTH
 from made_tof import ADI_LENS, adi_frame
-from tofuse.engine.errors import InputError
+from refused import refused
 from tofuse.formats.recordings.open import open_recording
 
 
@@ -43,8 +43,7 @@ def test_arducam_in_metres_along_ray(tmp_path: Path) -> None:
 
 def test_arducam_raw_phases_are_refused(tmp_path: Path) -> None:
     (tmp_path / "raw_240_1800_u16_1700000000000.raw").write_bytes(bytes(100))
-    with pytest.raises(InputError, match="not the sensor's raw phases"):
-        open_recording(tmp_path, format="arducam")
+    refused("not the sensor's raw phases", tmp_path, format="arducam")
 
 
 def check_adi(frame: object, k: int) -> None:
@@ -100,5 +99,4 @@ def test_other_bin_files_are_not_taken_for_aditof(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     for size in (100, 128, 10_000, 1 << 20):
         path.write_bytes(rng.bytes(size))
-        with pytest.raises(InputError, match="not a recording of a known format"):
-            open_recording(path)
+        refused("not a recording of a known format", path)

@@ -11,6 +11,7 @@ import pytest
 
 import made_arrays
 from camera_files import EVERY, made
+from refused import refused
 from ros_bags import COUNTS, TOPIC, Bag
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
 from tofuse.engine.errors import InputError
@@ -117,5 +118,9 @@ def test_ray_table_is_used_and_other_size_refused(tmp_path: Path, case: str) -> 
 def test_camera_is_refused_where_not_applicable(tmp_path: Path, name: str) -> None:
     file, _ = camera_file(tmp_path / "given", (16, 12), 0.001, "z")
     path, format_ = made(name, tmp_path)
-    with pytest.raises(InputError, match=r"camera: does not apply to the format .*leave it out"):
-        open_recording(tmp_path / path, format=format_, camera=file)
+    refused(
+        r"camera: does not apply to the format .*leave it out",
+        tmp_path / path,
+        format=format_,
+        camera=file,
+    )

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import tofuse
+from cli_calls import refuses
 from tofuse.apps.cli.program import main
 from tofuse.apps.results import integrity, load_result, run_json
 from tofuse.engine.errors import InputError
@@ -47,8 +48,7 @@ def test_edited_file_is_refused_by_name_or_accepted(result, name, capfd) -> None
     (result / name).write_bytes((result / name).read_bytes().replace(b"1", b"2", 1))
     with pytest.raises(InputError, match=f"{name} was changed after the run"):
         tofuse.load(result)
-    assert main(["export", str(result), "pcd"]) == 2
-    assert f"{name} was changed after the run" in capfd.readouterr().err
+    refuses(capfd, "export", result, "pcd", says=f"{name} was changed after the run")
     assert main(["export", str(result), "pcd", "--edited"]) == 0
 
 
