@@ -19,13 +19,13 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry.rays import unit_rays
 from tofuse.formats.cameras.calibration_files import read_correction
-from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.scenes import checkerboard
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.sensor import factory_correction
+from written import record
 
 BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)
 CAMERA = Pinhole(48, 36, 45.0, 45.0, 23.5, 17.5)
@@ -199,14 +199,9 @@ def test_wall_at_unknown_poses_reduces_wiggling_below_3_mm(views: Recording) -> 
 def test_command_writes_correction_that_is_applied(
     views: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    model = camera_model("sr4000")
     folder = tmp_path / "rec"
-    writer = RecordingWriter(
-        folder, model.camera, depth_unit_m=0.0001, amplitude_kind="range_compensated"
-    )
-    for k, frame in enumerate(views.select(end=12)):
-        writer.add(replace(frame, timestamp=float(k)))
-    writer.finish()
+    seen = [replace(f, timestamp=float(k)) for k, f in enumerate(views.select(end=12))]
+    record(folder, seen, depth_unit_m=0.0001, amplitude_kind="range_compensated")
     before = open_recording(folder)[0]
     out = folder / "correction.npz"
     command = ["calibrate", "depth", str(folder), "--planes", "1", "--out", str(out)]

@@ -20,12 +20,12 @@ from tofuse.engine.errors import InputError, on_command_line
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.scenes import checkerboard
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
+from written import record
 
 BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)
 TRUE = camera_model("sr4000").camera
@@ -188,12 +188,8 @@ def test_command_writes_camera_for_readers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     wrong = replace(TRUE, fx=200.0)
-    writer = RecordingWriter(
-        tmp_path / "rec", wrong, depth_unit_m=0.0001, amplitude_kind="range_compensated"
-    )
-    for k, frame in enumerate(frames()[:10]):
-        writer.add(replace(frame, camera=wrong, timestamp=float(k)))
-    writer.finish()
+    seen = [replace(f, camera=wrong, timestamp=float(k)) for k, f in enumerate(frames()[:10])]
+    record(tmp_path / "rec", seen, depth_unit_m=0.0001, amplitude_kind="range_compensated")
     out = tmp_path / "new" / "camera.json"
     command = ["calibrate", "lens", str(tmp_path / "rec"), "--board", "8x6:0.1"]
     text = printed(capsys, *command, "--out", out)

@@ -20,13 +20,13 @@ from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.noise.model import NOISE, NoiseModel, noise_model_for
 from tofuse.formats.cameras.calibration_files import read_noise
-from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.render import render
 from tofuse.lab.world.scene import build
+from written import record
 
 CAMERA = Pinhole(80, 60, 60.0, 60.0, 39.5, 29.5)
 
@@ -165,13 +165,9 @@ def test_unsuitable_recordings_are_rejected(frames, message: str) -> None:
 
 
 def test_noise_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    model = camera_model("sr4000")
-    writer = RecordingWriter(
-        tmp_path / "rec", model.camera, depth_unit_m=0.0001, amplitude_kind="range_compensated"
-    )
-    for k, frame in enumerate(still_frames("corner", "sr4000", 8)[:4]):
-        writer.add(replace(frame, timestamp=k / 30))
-    writer.finish()
+    still = still_frames("corner", "sr4000", 8)[:4]
+    seen = [replace(frame, timestamp=k / 30) for k, frame in enumerate(still)]
+    record(tmp_path / "rec", seen, depth_unit_m=0.0001, amplitude_kind="range_compensated")
     out = tmp_path / "rec" / "noise.json"
     text = printed(capsys, "noise", tmp_path / "rec", "--out", out, "--name", "mine")
     assert "raw amplitude" in text

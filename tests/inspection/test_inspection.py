@@ -34,10 +34,10 @@ from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.pose_accuracy import Accuracy, WorstFrame
 from tofuse.engine.results.types import Reason, SelfCalibration
-from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 from wrapped_depth import wrapping
+from written import record
 
 CAMERA = Pinhole(40, 30, 40.0, 40.0, 19.5, 14.5)
 
@@ -60,10 +60,7 @@ def copy(room_recording, tmp_path) -> Path:
 
 def written(folder: Path, frames, **changes) -> Path:
     """A native recording of the frames, with changed entries of its camera.json."""
-    writer = RecordingWriter(folder, frames[0].camera, frame_rate_hz=10.0)
-    for frame in frames:
-        writer.add(frame)
-    writer.finish()
+    record(folder, frames, frame_rate_hz=10.0)
     camera = json.loads((folder / "camera.json").read_text())
     (folder / "camera.json").write_text(json.dumps(camera | changes))
     return folder

@@ -31,7 +31,7 @@ from tofuse.engine.graph.external_sensors import OdometryEdges
 from tofuse.engine.progress import Silent
 from tofuse.formats.geometry import read_textured_glb
 from tofuse.formats.poses.trajectory import read_tum, write_tum
-from tofuse.formats.recordings.native import RecordingWriter
+from written import record
 from written_run_json import change_run, run_json
 
 HERE, THERE = made_sessions.HERE[::2], made_sessions.THERE[::2]
@@ -281,11 +281,8 @@ def test_recording_with_other_images_is_refused(session_results, tmp_path) -> No
 
 
 def test_results_of_clouds_are_refused(session_results, tmp_path) -> None:
-    writer = RecordingWriter(tmp_path / "clouds", None, frame_rate_hz=10.0)
     points = np.random.default_rng(0).uniform(1, 2, (50, 3)).astype(np.float32)
-    for k in range(N):
-        writer.add(CloudFrame(k, k / 10, points))
-    writer.finish()
+    record(tmp_path / "clouds", [CloudFrame(k, k / 10, points) for k in range(N)])
     again = copied(session_results["there"], tmp_path)
     run = json.loads((again / "run.json").read_text())
     run["input"]["opening"]["paths"] = [str(tmp_path / "clouds")]

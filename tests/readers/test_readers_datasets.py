@@ -33,6 +33,7 @@ from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.images.images import read_image, write_png
 from tofuse.formats.poses.trajectory import write_tum
 from tofuse.formats.recordings.open import open_recording
+from written import camera_json
 
 
 def test_sr4000_points_equal_stored_vectors(tmp_path: Path) -> None:
@@ -100,17 +101,12 @@ def test_tum_with_colour_of_half_the_rate(tmp_path: Path) -> None:
 def test_tum_with_unknown_name_requires_camera(tmp_path: Path) -> None:
     make_tum(tmp_path / "living_room")
     refused(r"with camera=camera\.json", tmp_path / "living_room")
-    camera = {"schema": 1, "model": "pinhole", "width": 640, "height": 480}
-    camera |= {"fx": 481.2, "fy": 480.0, "cx": 319.5, "cy": 239.5}
-    camera |= {"depth_unit_m": 0.0002, "depth_kind": "range"}
-    (tmp_path / "camera.json").write_text(json.dumps(camera))
-    frame = open_recording(tmp_path / "living_room", camera=tmp_path / "camera.json")[0]
-    assert frame.camera == Pinhole(640, 480, 481.2, 480.0, 319.5, 239.5)
-    assert frame.depth_kind == "range"
-    camera |= {"sensor": "ifm O3R222"}
-    (tmp_path / "camera.json").write_text(json.dumps(camera))
-    recording = open_recording(tmp_path / "living_room", camera=tmp_path / "camera.json")
-    assert family_of(recording, frame) == "ifm-o3r"
+    lens = Pinhole(640, 480, 481.2, 480.0, 319.5, 239.5)
+    file = camera_json(tmp_path / "camera.json", lens, depth_kind="range", sensor="ifm O3R222")
+    recording = open_recording(tmp_path / "living_room", camera=file)
+    assert recording[0].camera == lens
+    assert recording[0].depth_kind == "range"
+    assert family_of(recording, recording[0]) == "ifm-o3r"
 
 
 def test_tum_camera_of_other_data_sets(tmp_path: Path) -> None:
@@ -297,12 +293,10 @@ def test_colour_of_camera_in_given_camera_json(tmp_path: Path) -> None:
     assert "colour can't be read in 3 frames" in recording.warnings[-1]
     assert "pass its camera in camera.json" in recording.warnings[-1]
     lens = {"width": 320, "height": 240, "fx": 300.0, "fy": 300.0, "cx": 159.5, "cy": 119.5}
-    camera = {"schema": 1, "model": "pinhole", "width": 640, "height": 480}
-    camera |= {"fx": 600.0, "fy": 600.0, "cx": 319.5, "cy": 239.5}
-    camera |= {"depth_unit_m": 0.001, "depth_kind": "z"}
-    camera |= {"color": {"intrinsics": lens, "T_color_depth": np.eye(4).tolist()}}
-    (tmp_path / "given.json").write_text(json.dumps(camera))
-    frame = open_recording(tmp_path, camera=tmp_path / "given.json")[0]
+    color = {"intrinsics": lens, "T_color_depth": np.eye(4).tolist()}
+    whole = Pinhole(640, 480, 600.0, 600.0, 319.5, 239.5)
+    given = camera_json(tmp_path / "given.json", whole, color=color)
+    frame = open_recording(tmp_path, camera=given)[0]
     expected = np.tile(np.arange(640) // 4, (480, 1))
     seen = frame.color_image[..., 0] > 0
     assert seen.mean() > 0.2  # random depth occludes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,12 +12,14 @@ import pytest
 import made_exports as made
 from made_exports import BEHIND_M, CAMERA
 from refused import refused
+from tofuse.engine.cameras.cameras import BrownConrady
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.formats.geometry.ply import read_ply, write_ply
 from tofuse.formats.images.images import read_tiff
 from tofuse.formats.recordings.open import open_recording
+from written import camera_json
 
 Maker = Callable[[Path], None]
 MAKERS: dict[str, tuple[Maker, float]] = {
@@ -94,19 +95,15 @@ def test_missing_points_leave_others_on_their_pixels(tmp_path: Path) -> None:
     np.testing.assert_array_equal(thinned.amplitude_image[both], whole.amplitude_image[both])
 
 
-def camera_json(folder: Path, **changes: object) -> Path:
-    fields: dict[str, object] = {"schema": 1, "model": "brown", "width": 32, "height": 24}
-    fields |= {name: getattr(CAMERA, name) for name in ("fx", "fy", "cx", "cy")}
-    fields |= {"distortion": [CAMERA.k1, CAMERA.k2, CAMERA.p1, 0.0]}
-    fields |= {"depth_unit_m": 0.001, "depth_kind": "range"} | changes
-    (folder / "camera.json").write_text(json.dumps(fields))
-    return folder / "camera.json"
+def camera_of(folder: Path, lens: BrownConrady = CAMERA, **changes: object) -> Path:
+    bent = {"model": "brown", "distortion": [lens.k1, lens.k2, lens.p1, 0.0]}
+    return camera_json(folder / "camera.json", lens, **(bent | {"depth_kind": "range"} | changes))
 
 
 def test_tiff3d_with_camera(tmp_path: Path) -> None:
     made.make_tiff3d(tmp_path / "a")
     refused(r"has no camera: the layout of \.t3c .* use camera=camera\.json", tmp_path / "a")
-    camera = camera_json(tmp_path, frame_rate_hz=25.0, ambiguity_m=7.5)
+    camera = camera_of(tmp_path, frame_rate_hz=25.0, ambiguity_m=7.5)
     recording = open_recording(tmp_path / "a", camera=camera)
     assert (recording.format, len(recording)) == ("tiff", 3)
     np.testing.assert_allclose(recording.timestamps, [0, 0.04, 0.08])
@@ -126,12 +123,12 @@ def test_other_tiffs_are_depth_on_request(tmp_path: Path) -> None:
     cv2.imwrite(str(folder / "depth_1.tiff"), counts)
     cv2.imwrite(str(folder / "confidence_1.tiff"), counts)
     refused(r"use format tiff and camera=camera\.json", folder)
-    camera = camera_json(tmp_path, depth_unit_m=1e-4, depth_kind="z")
+    camera = camera_of(tmp_path, depth_unit_m=1e-4, depth_kind="z")
     frame = open_recording(folder, format="tiff", camera=camera)[0]
     assert frame.amplitude_image is None
     counts[0, 0] = 0
     np.testing.assert_allclose(frame.z, counts * 1e-4, rtol=1e-6)
-    small = camera_json(tmp_path, width=16, height=12)
+    small = camera_of(tmp_path, width=16, height=12)
     refused("32 x 24 pixels, the camera 16 x 12", folder, format="tiff", camera=small)
 
 

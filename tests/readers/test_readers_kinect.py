@@ -11,10 +11,11 @@ import pytest
 
 import made_kinect as made
 from refused import refused
-from tofuse.engine.cameras.cameras import RayTable
+from tofuse.engine.cameras.cameras import Pinhole, RayTable
 from tofuse.engine.geometry.rays import homogeneous
 from tofuse.formats.cameras.camera_file import ColorCamera
 from tofuse.formats.recordings.open import open_recording
+from written import camera_json
 
 SIZES = {
     "NFOV_2X2BINNED": (320, 288, 512, 96, 90),
@@ -28,13 +29,8 @@ def opencv_lens(mode: str, lens: list[float]) -> tuple[np.ndarray, np.ndarray]:
     """K and distortion in OpenCV's order, by the definition of the calibration."""
     _, _, whole, left, top = SIZES[mode]
     cx, cy, fx, fy, *k = lens
-    K = np.array(
-        [
-            [fx * whole, 0, cx * whole - left - 0.5],
-            [0, fy * whole, cy * whole - top - 0.5],
-            [0, 0, 1],
-        ]
-    )
+    center = (cx * whole - left - 0.5, cy * whole - top - 0.5)
+    K = np.array([[fx * whole, 0, center[0]], [0, fy * whole, center[1]], [0, 0, 1]])
     return K, np.array([k[0], k[1], k[9], k[8], k[2], k[3], k[4], k[5]])
 
 
@@ -152,10 +148,8 @@ def test_missing_tracks_and_calibration_are_named(tmp_path: Path) -> None:
     refused("only infrared", path)
     made.make_mkv(path, depth, without="calibration")
     refused(r"calibration\.json: is missing; pass .* with camera=camera\.json", path)
-    camera = {"schema": 1, "model": "pinhole", "width": 320, "height": 288, "fx": 250, "fy": 250}
-    camera |= {"cx": 160, "cy": 144, "depth_unit_m": 0.001, "depth_kind": "z"}
-    (tmp_path / "camera.json").write_text(json.dumps(camera))
-    assert len(open_recording(path, camera=tmp_path / "camera.json")[0]) > 1000
+    camera = camera_json(tmp_path / "camera.json", Pinhole(320, 288, 250, 250, 160, 144))
+    assert len(open_recording(path, camera=camera)[0]) > 1000
     made.make_mkv(path, depth[:, :100])
     refused("320 x 100 pixels, of no known mode", path)
 

@@ -19,6 +19,7 @@ from tofuse.formats.poses.trajectory import write_tum
 from tofuse.formats.readers.native import NativeSource
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
+from written import record
 
 PINHOLE = Pinhole(40, 30, 35.0, 36.0, 19.5, 14.5)
 CAMERAS: list[Camera] = [
@@ -44,10 +45,8 @@ def image(index: int, camera: Camera = PINHOLE, **changes: Any) -> RangeFrame:
 
 
 def write(folder: Path, count: int = 4, camera: Camera = PINHOLE, **options: Any) -> Path:
-    writer = RecordingWriter(folder, camera, **({"depth_unit_m": 0.0005} | options))
-    for k in range(count):
-        writer.add(image(k, camera))
-    return writer.finish()
+    frames = [image(k, camera) for k in range(count)]
+    return record(folder, frames, **({"depth_unit_m": 0.0005} | options))
 
 
 def edit(folder: Path, **changes: Any) -> None:
@@ -60,16 +59,8 @@ def edit(folder: Path, **changes: Any) -> None:
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.model)
 @pytest.mark.parametrize("kind", ["z", "range"])
 def test_round_trip(tmp_path: Path, camera: Camera, kind: str) -> None:
-    write(
-        tmp_path / "a",
-        camera=camera,
-        depth_kind=kind,
-        frame_rate_hz=8.0,
-        ambiguity_m=5.0,
-        confidence_max=7.0,
-        amplitude_kind="raw",
-    )
-    source = NativeSource(tmp_path / "a")
+    facts = {"frame_rate_hz": 8, "ambiguity_m": 5, "confidence_max": 7, "amplitude_kind": "raw"}
+    source = NativeSource(write(tmp_path / "a", camera=camera, depth_kind=kind, **facts))
     assert source.warnings == []
     np.testing.assert_array_equal(source.timestamps, np.arange(4) / 8)
     assert type(source.camera) is type(camera)
@@ -80,14 +71,9 @@ def test_round_trip(tmp_path: Path, camera: Camera, kind: str) -> None:
         assert frame.index == k
         # Half a count of range changes z by no more.
         np.testing.assert_allclose(frame.z, truth.z, atol=0.00025 + 1e-6)
-        np.testing.assert_array_equal(frame.valid, truth.valid)
-        np.testing.assert_array_equal(frame.amplitude_image, truth.amplitude_image)
-        np.testing.assert_array_equal(frame.confidence_image, truth.confidence_image)
-        np.testing.assert_array_equal(frame.color_image, truth.color_image)
-    assert source.metadata["ambiguity_m"] == 5
-    assert source.metadata["confidence_max"] == 7
-    assert source.metadata["amplitude_kind"] == "raw"
-    assert source.metadata["frame_rate_hz"] == 8
+        for name in ("valid", "amplitude_image", "confidence_image", "color_image"):
+            np.testing.assert_array_equal(getattr(frame, name), getattr(truth, name))
+    assert facts.items() <= source.metadata.items()
 
 
 def test_zero_and_65535_are_invalid(tmp_path: Path) -> None:
@@ -134,8 +120,7 @@ def test_other_arrays_as_depth_are_refused(tmp_path: Path, saved: Any, words: st
     with pytest.raises(UnreadableFrameError, match=words):
         NativeSource(folder).read(0)
     np.save(folder / "depth" / "000000.npy", np.ones((40, 30)))
-    with pytest.raises(InputError, match=r"000000.npy: is 30 x 40 pixels, camera.json states"):
-        NativeSource(folder)
+    refused(r"000000.npy: is 30 x 40 pixels, camera.json states", folder)
 
 
 def test_depth_beyond_sixteen_bits_is_invalid_and_counted(tmp_path: Path) -> None:
@@ -226,8 +211,7 @@ def test_color_of_other_camera_is_projected(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frame.color_image[inside][:, :2], expected[inside])
     assert (frame.color_image[~inside] == 0).all()
     edit(folder, color=None)
-    with pytest.raises(InputError, match=r'"color" in camera.json'):
-        NativeSource(folder)
+    refused(r'"color" in camera.json', folder)
 
 
 @pytest.mark.parametrize(
@@ -261,26 +245,21 @@ def test_color_of_other_camera_is_projected(tmp_path: Path) -> None:
 def test_invalid_fields_are_named(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
     folder = write(tmp_path / "a", 1)
     edit(folder, **changes)
-    with pytest.raises(InputError, match=words) as caught:
-        NativeSource(folder)
-    assert str(folder) in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert str(folder) in str(refused(words, folder))
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1, 2]", '{"schema": 1,}', "[" * 100000, "\x00"])
 def test_broken_json(tmp_path: Path, text: str) -> None:
     folder = write(tmp_path / "a", 1)
     (folder / "camera.json").write_text(text)
-    with pytest.raises(InputError, match="JSON"):
-        NativeSource(folder)
+    refused("JSON", folder)
 
 
 @pytest.mark.parametrize("name", ["amplitude", "confidence", "color", "depth"])
 def test_inconsistent_counts(tmp_path: Path, name: str) -> None:
     folder = write(tmp_path / "a")
     (folder / name / "000002.png").unlink()
-    with pytest.raises(InputError, match=r"has 3 |has 4 "):
-        NativeSource(folder)
+    refused(r"has 3 |has 4 ", folder)
 
 
 def test_images_of_other_frames(tmp_path: Path) -> None:
@@ -294,8 +273,7 @@ def test_images_of_other_frames(tmp_path: Path) -> None:
     for name in ("depth", "amplitude", "confidence"):
         (folder / name / "000001.png").unlink()
     (folder / "color" / "000002.png").unlink()
-    with pytest.raises(InputError, match="color: has names of other frames"):
-        NativeSource(folder)
+    refused("color: has names of other frames", folder)
 
 
 @pytest.mark.parametrize(
@@ -316,8 +294,7 @@ def test_images_of_other_frames(tmp_path: Path) -> None:
 def test_invalid_files_beside_images(tmp_path: Path, name: str, text: str, words: str) -> None:
     folder = write(tmp_path / "a")
     (folder / name).write_text(text)
-    with pytest.raises(InputError, match=words):
-        NativeSource(folder)
+    refused(words, folder)
 
 
 def test_unsorted_and_repeated_timestamps_warn(tmp_path: Path) -> None:
@@ -330,23 +307,21 @@ def test_unsorted_and_repeated_timestamps_warn(tmp_path: Path) -> None:
     assert "frames 1 and 2 have the same timestamp" in NativeSource(folder).warnings[0]
 
 
-def test_unusable_rays(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("rays", "says"),
+    [
+        (PINHOLE.rays()[:, [0, *range(40)]], r"is 41 x 30, camera.json says 40 x 30"),
+        (np.zeros((30, 40, 2), np.float32), "has only equal rays"),
+        (np.full((30, 40, 2), np.nan, np.float32), "has no pixel with a ray"),
+        (np.zeros((30, 40), np.float32), "shape"),
+        (np.array([{}], object), r"rays\.npy"),
+    ],
+    ids=["size", "equal", "undefined", "shape", "objects"],
+)
+def test_unusable_rays(tmp_path: Path, rays: np.ndarray, says: str) -> None:
     folder = write(tmp_path / "a")
-    np.save(folder / "rays.npy", PINHOLE.rays()[:, [0, *range(40)]])
-    with pytest.raises(InputError, match=r"is 41 x 30, camera.json says 40 x 30"):
-        NativeSource(folder)
-    np.save(folder / "rays.npy", np.zeros((30, 40, 2), np.float32))
-    with pytest.raises(InputError, match="has only equal rays"):
-        NativeSource(folder)
-    np.save(folder / "rays.npy", np.full((30, 40, 2), np.nan, np.float32))
-    with pytest.raises(InputError, match="has no pixel with a ray"):
-        NativeSource(folder)
-    np.save(folder / "rays.npy", np.zeros((30, 40), np.float32))
-    with pytest.raises(InputError, match="shape"):
-        NativeSource(folder)
-    np.save(folder / "rays.npy", np.array([{}], object), allow_pickle=True)
-    with pytest.raises(InputError, match=r"rays\.npy"):
-        NativeSource(folder)
+    np.save(folder / "rays.npy", rays, allow_pickle=True)
+    refused(says, folder)
 
 
 def test_rays_override_the_lens(tmp_path: Path) -> None:
@@ -362,8 +337,7 @@ def test_rays_with_forged_header(tmp_path: Path) -> None:
         claim = {"descr": "<f4", "fortran_order": False, "shape": (30000, 4000000, 2)}
         np.lib.format.write_array_header_1_0(file, claim)
         file.write(bytes(1000))
-    with pytest.raises(InputError, match=r"rays\.npy"):
-        NativeSource(folder)
+    refused(r"rays\.npy", folder)
 
 
 def test_damaged_frame_is_an_unreadable_frame(tmp_path: Path) -> None:
@@ -456,8 +430,7 @@ def test_writer_refuses_invalid_frames(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="poses"):
         writer.finish(groundtruth=np.zeros((2, 4, 4)))
     # At this point the folder is not a recording yet.
-    with pytest.raises(InputError, match=r"camera\.json"):
-        NativeSource(tmp_path / "a")
+    refused(r"camera\.json", tmp_path / "a")
     writer.finish()
     with pytest.raises(OutputError, match="isn't empty"):
         RecordingWriter(tmp_path / "a", PINHOLE)

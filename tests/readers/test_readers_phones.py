@@ -27,8 +27,7 @@ def test_scanner_app_derives_image_size_from_projection(tmp_path: Path) -> None:
     for path in (tmp_path / "scan").glob("frame_*.json"):
         facts = json.loads(path.read_text())
         facts["intrinsics"] = [v / 2 for v in facts["intrinsics"]]
-        facts["projectionMatrix"] = np.diag([2 * made.FX / 1920, 2 * made.FX / 1440, -1, 0])
-        facts["projectionMatrix"] = facts["projectionMatrix"].ravel().tolist()
+        facts["projectionMatrix"] = made.projection(made.FX).ravel().tolist()
         path.write_text(json.dumps(facts))
     frame = open_recording(tmp_path / "scan")[0]
     assert isinstance(frame.camera, Pinhole)

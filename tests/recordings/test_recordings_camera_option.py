@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from ros_bags import COUNTS, TOPIC, Bag
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
 from tofuse.engine.errors import InputError
 from tofuse.formats.recordings.open import open_recording
+from written import camera_json
 
 
 def npz_metres(path: Path) -> Path:
@@ -61,15 +61,12 @@ def recorded(case: str, folder: Path) -> tuple[Path, str]:
 def camera_file(
     folder: Path, size: tuple[int, int], unit: float, kind: str
 ) -> tuple[Path, BrownConrady]:
-    lens = BrownConrady(
-        *size, 1.1 * size[0], 1.2 * size[0], size[0] / 2, size[1] / 2, k1=0.05, p2=0.001
-    )
-    fields = {"schema": 1, "model": "brown", "width": size[0], "height": size[1]}
-    fields |= {name: getattr(lens, name) for name in ("fx", "fy", "cx", "cy")}
-    fields |= {"distortion": [0.05, 0, 0, 0.001], "depth_unit_m": unit, "depth_kind": kind}
+    center = (size[0] / 2, size[1] / 2)
+    lens = BrownConrady(*size, 1.1 * size[0], 1.2 * size[0], *center, k1=0.05, p2=0.001)
+    bent = {"model": "brown", "distortion": [0.05, 0, 0, 0.001]}
     folder.mkdir()
-    (folder / "camera.json").write_text(json.dumps(fields))
-    return folder / "camera.json", lens
+    path = folder / "camera.json"
+    return camera_json(path, lens, **bent, depth_unit_m=unit, depth_kind=kind), lens
 
 
 @pytest.mark.parametrize("case", [*TAKES, *METRES])

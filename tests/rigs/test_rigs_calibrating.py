@@ -22,10 +22,10 @@ from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.formats.poses.trajectory import read_tum
-from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import Opening, open_recording
 from tofuse.formats.rigs.rig_file import Rig, RigCamera, read_rig, write_rig
 from tofuse.lab.simulation.rig import camera_ring, relative
+from written import record
 
 # Three cameras, neighbours 25 degrees apart.
 STANDS = [
@@ -45,10 +45,7 @@ def camera(k: int, frames: list[RangeFrame]) -> Camera:
 
 def written(folder: Path, count: int = 2, cameras: int = 3) -> Path:
     for k in range(cameras):
-        writer = RecordingWriter(folder / f"cam{k}", CAMERA, frame_rate_hz=30.0, depth_unit_m=2e-4)
-        for frame in images(k, count):
-            writer.add(frame)
-        writer.finish()
+        record(folder / f"cam{k}", images(k, count), frame_rate_hz=30.0, depth_unit_m=2e-4)
     return folder
 
 
