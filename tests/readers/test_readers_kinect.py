@@ -71,7 +71,6 @@ def test_images_timestamps_and_metadata(tmp_path: Path) -> None:
     depth = made.small_counts()
     made.make_mkv(tmp_path / "rec" / "a.mkv", depth, infrared=depth // 2)
     recording = open_recording(tmp_path / "rec")  # a folder that holds one
-    assert (recording.format, len(recording)) == ("azure-kinect", 3)
     np.testing.assert_allclose(recording.timestamps, 5 + 7e-6 + 0.033333 * np.arange(3))
     for k, frame in enumerate(recording):
         np.testing.assert_allclose(frame.z, depth[k] / 1000, atol=1e-6)
