@@ -52,16 +52,10 @@ def made_result(folder: Path, camera: Camera, *, config=None) -> Path:
     recording = record(folder / "scan", frames)
     result = folder / "result"
     result.mkdir()
-    frames = [
-        {
-            "index": k,
-            "timestamp": 0.1 * k,
-            "status": "tracked" if k in POSED else "lost",
-            "component": 0 if k in POSED else None,
-            "covariance": None if k == 1 else (np.eye(6) * k).ravel().tolist(),
-        }
-        for k in range(5)
-    ]
+    frames = [{"index": k, "timestamp": 0.1 * k} for k in range(5)]
+    for k, frame in enumerate(frames):
+        seen = {"status": "tracked", "component": 0} if k in POSED else {"status": "lost"}
+        frame |= seen | {"covariance": None if k == 1 else (np.eye(6) * k).ravel().tolist()}
     write_tum(result / "trajectory.txt", 0.1 * np.array(POSED), POSES[POSED])
     points = np.random.default_rng(5).normal(size=(40, 3)).astype(np.float32)
     write_ply(result / "cloud.ply", GeometryRecord(points, color=np.full((40, 3), 77, np.uint8)))

@@ -22,16 +22,11 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
 
 
 _FIELDS: dict[str, Any] = {
-    "schema": 1,
-    "version": __version__,
-    "verdict": "good",
-    "seed": 0,
+    "schema": 1, "version": __version__, "verdict": "good", "seed": 0,
     "accuracy": {"position_m": None, "rotation_rad": None, "relative": None},
-    "reasons": [],
-    "frames": [],
+    "reasons": [], "frames": [], "components": [],
     "T_up_world": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
-    "components": [],
-}
+}  # fmt: skip
 _FRAME = {"status": "tracked", "component": None, "covariance": None}
 
 
