@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import shutil
 from collections.abc import Callable
@@ -15,6 +14,7 @@ import pytest
 from cli_calls import listing, refuses
 from tofuse.apps.cli.program import main
 from tofuse.formats.images.images import read_image, write_png
+from written import change_camera
 
 
 @pytest.fixture
@@ -32,11 +32,6 @@ def recording(room_recording, tmp_path) -> Path:
     for name in ("groundtruth.txt", "timestamps.txt", "frames.csv"):
         (copy / name).unlink()
     return copy
-
-
-def camera(recording: Path, **changes: object) -> None:
-    data = json.loads((recording / "camera.json").read_text()) | changes
-    (recording / "camera.json").write_text(json.dumps(data))
 
 
 def truncate_all(recording: Path) -> None:
@@ -72,7 +67,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
     "broken json": (lambda r: (r / "camera.json").write_text('{"a": '), ("camera.json", "JSON")),
     "json bytes": (lambda r: (r / "camera.json").write_bytes(b"\xff\xfe\0"), ("camera.json",)),
     "all frames invalid": (blank_all, ("has 4 frames, none with", "0 valid points")),
-    "nan": (lambda r: camera(r, fx=float("nan")), ("camera.json", "fx", "nan")),
+    "nan": (lambda r: change_camera(r, fx=float("nan")), ("camera.json", "fx", "nan")),
     "fewer amplitudes": (lambda r: (r / "amplitude/000002.png").unlink(), ("amplitude", "3", "4")),
     "folder for camera.json": (folder_for_file, ("rec",)),
     "folders for images": (folders_for_images, ("rec",)),

@@ -27,3 +27,10 @@ def camera_json(path: Path, lens: Pinhole, **fields: Any) -> Path:
     about |= {name: getattr(lens, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     path.write_text(json.dumps(about | fields))
     return path
+
+
+def change_camera(folder: Path, **changes: Any) -> None:
+    """Change fields of the camera.json of a recording; None removes one."""
+    path = folder / "camera.json"
+    fields = json.loads(path.read_text()) | changes
+    path.write_text(json.dumps({k: v for k, v in fields.items() if v is not None}))

@@ -45,6 +45,13 @@ def change_run(folder: Path, **changes: Any) -> None:
     _write(folder, {name: value for name, value in run.items() if value is not None})
 
 
+def read_from(folder: Path, recording: Path, **changes: Any) -> None:
+    """Change where the recording of a result is."""
+    given = read_run_json(folder / "run.json")["input"]
+    given["opening"]["paths"] = [str(recording)]
+    change_run(folder, input=given, **changes)
+
+
 def _write(folder: Path, run: dict[str, Any]) -> None:
     path = folder / "run.json"
     path.unlink(missing_ok=True)

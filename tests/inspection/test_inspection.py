@@ -37,7 +37,7 @@ from tofuse.engine.results.types import Reason, SelfCalibration
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 from wrapped_depth import wrapping
-from written import record
+from written import change_camera, record
 
 CAMERA = Pinhole(40, 30, 40.0, 40.0, 19.5, 14.5)
 
@@ -61,8 +61,7 @@ def copy(room_recording, tmp_path) -> Path:
 def written(folder: Path, frames, **changes) -> Path:
     """A native recording of the frames, with changed entries of its camera.json."""
     record(folder, frames, frame_rate_hz=10.0)
-    camera = json.loads((folder / "camera.json").read_text())
-    (folder / "camera.json").write_text(json.dumps(camera | changes))
+    change_camera(folder, **changes)
     return folder
 
 
@@ -107,9 +106,8 @@ def test_facts_of_synthetic_frames() -> None:
 def test_wrong_unit_is_detected(z) -> None:
     remedies = "Check depth_unit_m", f"multiply those in the files by {2 / z:g}"
     for frame, remedy in zip((image(z), CloudFrame.of(image(z).points)), remedies, strict=True):
-        (warning,) = (
-            str(f) for f in inspect_recording(of([frame])).findings if f.code == "depth_unit"
-        )
+        found = inspect_recording(of([frame])).findings
+        (warning,) = (str(f) for f in found if f.code == "depth_unit")
         assert remedy in warning
         assert f"{z:.2g}"[:1] in warning
 
@@ -119,9 +117,8 @@ def test_clouds_in_different_units_are_detected() -> None:
         points = image(2.0).points
         return of([CloudFrame.of(f * points, index=k) for k, f in enumerate(factors)])
 
-    finding = next(
-        f for f in inspect_recording(clouds(1, 1000, 1)).findings if f.code == "depth_unit"
-    )
+    found = inspect_recording(clouds(1, 1000, 1)).findings
+    finding = next(f for f in found if f.code == "depth_unit")
     assert "median distance of frame 1 is" in finding.text
     assert finding.remedy.endswith("these frames by 0.001.")
     # Of two, either may be meant; near and far scans of one place differ less.
@@ -313,13 +310,10 @@ def test_wraps_are_severe_where_they_may_be_the_majority(scene, every, code) -> 
 def test_swapped_bytes_are_detected() -> None:
     v, u = np.mgrid[:72, :96]
     counts = [(1500 + 3 * u + 2 * v + 40 * k).astype(np.uint16) for k in range(4)]
-    right = [
-        RangeFrame(k, k / 10, BROWN, c.astype(np.float32) / 1000) for k, c in enumerate(counts)
-    ]
-    swapped = [
-        replace(f, depth=c.byteswap().astype(np.float32) / 1000)
-        for f, c in zip(right, counts, strict=True)
-    ]
+    right, swapped = (
+        [RangeFrame(k, k / 10, BROWN, c.astype(np.float32) / 1000) for k, c in enumerate(images)]
+        for images in (counts, [c.byteswap() for c in counts])
+    )
     found = {f.code: f for f in tofuse.inspect(of(swapped)).findings}
     assert "bytes" in found["depth_unit"].text
     assert "depth_unit" not in codes(right)
@@ -402,18 +396,11 @@ def test_flat_images_are_inspected(turn) -> None:
     """Those of a spinning scanner, too flat for shifts of a fraction of the width."""
     camera = turn[0].camera
     flat = Pinhole(camera.width, 16, camera.fx, camera.fy, camera.cx, camera.cy - 30)
-    frames = [
-        RangeFrame(
-            f.index,
-            f.timestamp,
-            flat,
-            f.depth[30:46],
-            f.depth_kind,
-            amplitude_image=f.amplitude_image[30:46],
-            color_image=np.ascontiguousarray(f.color_image[30:46]),
-        )
-        for f in colored(turn, 0)
-    ]
+    frames = []
+    for f in colored(turn, 0):
+        names = ("amplitude_image", "color_image")
+        images = {name: np.ascontiguousarray(getattr(f, name)[30:46]) for name in names}
+        frames.append(RangeFrame(f.index, f.timestamp, flat, f.depth[30:46], **images))
     assert not codes(frames) & {"mirrored", "color_unregistered", "delayed"}
 
 
@@ -422,14 +409,9 @@ def test_colors_of_other_frames_are_not_mirrored(turn) -> None:
     images = [f.color_image for f in colored(turn, 0)]
     for shift in (4, 7, 9):
         for flip in (np.s_[:], np.s_[:, ::-1], np.s_[::-1]):
-            frames = [
-                replace(
-                    f,
-                    amplitude_image=None,
-                    color_image=np.ascontiguousarray(images[(k + shift) % len(images)][flip]),
-                )
-                for k, f in enumerate(turn)
-            ]
+            others = [np.ascontiguousarray(image[flip]) for image in np.roll(images, -shift, 0)]
+            pairs = zip(turn, others, strict=True)
+            frames = [replace(f, amplitude_image=None, color_image=c) for f, c in pairs]
             assert not list(check_mirrored(Sample.of(of(frames), 8)))
 
 
@@ -496,12 +478,10 @@ def test_the_image_hardly_moves_around_an_object() -> None:
     turn = se3.exp(np.array([0, 0, 0, 0, np.radians(15), 0]))
     to_object = se3.exp(np.array([0, 0, 1.0, 0, 0, 0]))
     around = to_object @ turn @ se3.inverse(to_object)
-    shifts = [
-        replace(pair, alignment=replace(pair.alignment, T_world_source=T)).shift
-        for T in (turn, around)
-    ]
-    assert shifts[0] == pytest.approx(np.tan(np.radians(15)) / 0.75, rel=0.15)
-    assert shifts[1] < 0.1
+    poses = [replace(pair.alignment, T_world_source=T) for T in (turn, around)]
+    first, second = (replace(pair, alignment=pose).shift for pose in poses)
+    assert first == pytest.approx(np.tan(np.radians(15)) / 0.75, rel=0.15)
+    assert second < 0.1
 
 
 def test_camera_motion_is_classified() -> None:

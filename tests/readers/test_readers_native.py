@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from tofuse.formats.poses.trajectory import write_tum
 from tofuse.formats.readers.native import NativeSource
 from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
-from written import record
+from written import change_camera, record
 
 PINHOLE = Pinhole(40, 30, 35.0, 36.0, 19.5, 14.5)
 CAMERAS: list[Camera] = [
@@ -47,13 +46,6 @@ def image(index: int, camera: Camera = PINHOLE, **changes: Any) -> RangeFrame:
 def write(folder: Path, count: int = 4, camera: Camera = PINHOLE, **options: Any) -> Path:
     frames = [image(k, camera) for k in range(count)]
     return record(folder, frames, **({"depth_unit_m": 0.0005} | options))
-
-
-def edit(folder: Path, **changes: Any) -> None:
-    """Change fields of camera.json; None removes one."""
-    path = folder / "camera.json"
-    data = json.loads(path.read_text()) | changes
-    path.write_text(json.dumps({k: v for k, v in data.items() if v is not None}))
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.model)
@@ -203,14 +195,14 @@ def test_color_of_other_camera_is_projected(tmp_path: Path) -> None:
     v, u = np.mgrid[:50, :80]
     write_png(folder / "color" / "000000.png", np.stack([u, v, 0 * u], -1).astype(np.uint8))
     intrinsics = {"width": 80, "height": 50, "fx": 50.0, "fy": 50.0, "cx": 40.0, "cy": 25.0}
-    edit(folder, color={"intrinsics": intrinsics, "T_color_depth": T.tolist()})
+    change_camera(folder, color={"intrinsics": intrinsics, "T_color_depth": T.tolist()})
     frame = NativeSource(folder).read(0)
     expected = np.rint(color_camera.project(points_from_z(PINHOLE, z) @ T[:3, :3].T + T[:3, 3]))
     inside = ((expected >= 0) & (expected < [80, 50])).all(-1)
     assert inside.sum() > 1000
     np.testing.assert_array_equal(frame.color_image[inside][:, :2], expected[inside])
     assert (frame.color_image[~inside] == 0).all()
-    edit(folder, color=None)
+    change_camera(folder, color=None)
     refused(r'"color" in camera.json', folder)
 
 
@@ -244,7 +236,7 @@ def test_color_of_other_camera_is_projected(tmp_path: Path) -> None:
 )
 def test_invalid_fields_are_named(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
     folder = write(tmp_path / "a", 1)
-    edit(folder, **changes)
+    change_camera(folder, **changes)
     assert str(folder) in str(refused(words, folder))
 
 
@@ -378,7 +370,7 @@ def test_camera_of_different_image_size(tmp_path: Path) -> None:
     folder = write(tmp_path / "a")
     # The first image is truncated: the next readable one decides.
     (folder / "depth" / "000000.png").write_bytes(b"\x89PNG")
-    edit(folder, width=80)
+    change_camera(folder, width=80)
     with pytest.raises(InputError, match=r"camera.json states 80 x 30") as caught:
         NativeSource(folder)
     assert not isinstance(caught.value, UnreadableFrameError)
@@ -405,12 +397,12 @@ def test_color_for_display_may_have_any_size(tmp_path: Path) -> None:
     for k in range(2):
         write_png(folder / "color" / f"{k:06}.png", np.full((90, 160, 3), 100, np.uint8))
     refused(r'"color_registered": false', folder)
-    edit(folder, color_registered=False)
+    change_camera(folder, color_registered=False)
     frame = open_recording(folder)[0]
     assert not frame.color_registered
     assert frame.color_image.shape == (30, 40, 3)
     lens = {"width": 160, "height": 90, "fx": 100, "fy": 100, "cx": 80, "cy": 45}
-    edit(folder, color={"intrinsics": lens})
+    change_camera(folder, color={"intrinsics": lens})
     refused("T_color_depth: is missing", folder)
 
 

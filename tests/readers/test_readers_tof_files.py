@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from made_phones import DEPTH
 from made_tof import ADI_LENS, adi_frame
 from refused import refused
 from tofuse.formats.recordings.open import open_recording
+from written import change_camera
 
 
 def test_invalid_numbers_of_arducam(tmp_path: Path) -> None:
@@ -30,9 +30,7 @@ def test_invalid_numbers_of_arducam(tmp_path: Path) -> None:
 def test_arducam_in_metres_along_ray(tmp_path: Path) -> None:
     """Unit and kind are those of camera.json: earlier SDKs wrote metres."""
     made_tof.make_arducam(tmp_path / "scan")
-    path = tmp_path / "scan" / "camera.json"
-    about = json.loads(path.read_text()) | {"depth_unit_m": 1.0, "depth_kind": "range"}
-    path.write_text(json.dumps(about))
+    change_camera(tmp_path / "scan", depth_unit_m=1.0, depth_kind="range")
     frame = open_recording(tmp_path / "scan")[0]
     assert frame.depth_kind == "range"
     np.testing.assert_allclose(frame.depth[2:], 1000 * DEPTH[0][2:], rtol=1e-6)

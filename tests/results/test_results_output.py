@@ -158,14 +158,8 @@ def test_run_json_matches_contract(tmp_path) -> None:
     )
     assert data["schema"] == 1
     assert data["input"] == {"path": "/somewhere", "format": "native", "frames": 2, "opening": None}
-    assert data["reasons"] == [
-        {
-            "code": "lost_frames",
-            "frames": [1, 1],
-            "ranges": [[1, 1]],
-            "text": "Frame 1 has no pose.",
-        }
-    ]
+    reason = {"code": "lost_frames", "frames": [1, 1], "ranges": [[1, 1]]}
+    assert data["reasons"] == [reason | {"text": "Frame 1 has no pose."}]
     assert data["components"] == []
     assert [frame["component"] for frame in data["frames"]] == [None, None]
     assert data["frames"][0]["covariance"] == np.eye(6).ravel().tolist()
@@ -252,10 +246,9 @@ def test_folder_with_foreign_files_is_kept(tmp_path, name, when) -> None:
     before = contents(out)
     if when == "before":
         folder.discard()
-    with pytest.raises(OutputError, match=rf"out/{name}: is not a file of an earlier result; move"):
-        write_result(
-            torn(seed=1), OutputFolder(out, overwrite=True) if when == "before" else folder
-        )
+    says = rf"out/{name}: is not a file of an earlier result; move"
+    with pytest.raises(OutputError, match=says):
+        write_result(torn(1), OutputFolder(out, overwrite=True) if when == "before" else folder)
     assert contents(out) == before
 
 
