@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,10 @@ import pytest
 
 import made_arrays
 from camera_files import MAKERS
-from cli_calls import printed
+from cli_calls import printed, refuses
 from damaged_files import make_native, make_ply
 from made_recordings import make_sr4000
 from refused import refused
-from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
@@ -29,6 +27,7 @@ from tofuse.formats.readers.native import NativeSource
 from tofuse.formats.recordings import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
 from tofuse.formats.rigs.rig_file import Rig, RigCamera, write_rig
+from written import change_camera
 
 CHANNELS = ("amplitude_image", "confidence_image", "color_image")
 
@@ -84,11 +83,10 @@ def test_depth_stored_as_floats(tmp_path: Path) -> None:
     """A unit of 1 m, as of float arrays, is no count to which depth is rounded."""
     folder = tmp_path / "native"
     make_native(folder)
-    about = json.loads((folder / "camera.json").read_text()) | {"depth_unit_m": 1.0}
-    (folder / "camera.json").write_text(json.dumps(about))
+    change_camera(folder, depth_unit_m=1.0)
     for k, path in enumerate(sorted((folder / "depth").iterdir())):
-        depth = np.linspace(1, 2 + k, about["height"] * about["width"], dtype=np.float32)
-        np.save(path.with_suffix(".npy"), depth.reshape(about["height"], about["width"]))
+        depth = np.linspace(1, 2 + k, 30 * 40, dtype=np.float32)
+        np.save(path.with_suffix(".npy"), depth.reshape(30, 40))
         path.unlink()
     before = open_recording(folder)
     check_same(before, open_recording(convert(before, tmp_path / "out").folder), depth=6e-5)
@@ -158,11 +156,8 @@ def test_convert_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     lines = printed(capsys, *words).splitlines()
     assert lines[0] == f"2 frames in {tmp_path / 'out'}"
     assert any("depth_0001.png" in line for line in lines[1:])
-    assert main(words) == 2
-    error = capsys.readouterr().err
-    assert error == f"tofuse: {tmp_path / 'out'}: isn't empty; choose a new folder\n"
-    assert main([*words[:-1], str(tmp_path / "new"), "--start", "7"]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    refuses(capsys, *words, says=f"{tmp_path / 'out'}: isn't empty; choose a new folder")
+    refuses(capsys, *words[:-1], tmp_path / "new", "--start", "7", says="--start")
     assert not (tmp_path / "new").exists()
 
 

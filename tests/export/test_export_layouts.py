@@ -68,14 +68,11 @@ def test_wide_lens_is_cropped_at_sixty_degrees() -> None:
 
 def turned(frames: int = 4) -> Recording:
     rng = np.random.default_rng(6)
-    made, poses = [], []
+    made, reference = [], np.tile(np.eye(4), (frames, 1, 1))
     for k in range(frames):
         amplitude = rng.uniform(10, 900, (72, 96)).astype(np.float32)
         made.append(RangeFrame(k, 100.0 + k / 10, BARREL, plane_depth(BARREL), "z", amplitude))
-        T = np.eye(4)
-        T[0, 3] = 0.1 * k
-        poses.append(T)
-    reference = np.array(poses)
+        reference[k, 0, 3] = 0.1 * k
     reference[2] = np.nan
     return Recording.of(ArraySource(made, reference), "made", "made")
 

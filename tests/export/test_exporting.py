@@ -60,15 +60,9 @@ def result(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def expected(result: Path) -> SimpleNamespace:
-    ply = read_ply(result / "cloud.ply")
-    return SimpleNamespace(
-        points=ply.points,
-        normals=ply.normals,
-        color=ply.color,
-        views=ply.scalars["views"],
-        sigma=ply.scalars["sigma"],
-        faces=read_ply(result / "mesh.ply").faces,
-    )
+    ply, faces = read_ply(result / "cloud.ply"), read_ply(result / "mesh.ply").faces
+    columns = {name: getattr(ply, name) for name in ("points", "normals", "color")}
+    return SimpleNamespace(**columns, **ply.scalars, faces=faces)
 
 
 def test_ply_read_by_trimesh(result: Path, expected) -> None:
@@ -87,11 +81,9 @@ def test_pcd(result: Path, expected) -> None:
     pypcd4 = pytest.importorskip("pypcd4")
     (path,) = export(result, ["pcd"])
     cloud = pypcd4.PointCloud.from_path(path)
-    xyz = cloud.numpy(("x", "y", "z", "normal_x", "normal_y", "normal_z", "sigma", "views"))
-    np.testing.assert_array_equal(xyz[:, :3], expected.points)
-    np.testing.assert_array_equal(xyz[:, 3:6], expected.normals)
-    np.testing.assert_array_equal(xyz[:, 6], expected.sigma)
-    np.testing.assert_array_equal(xyz[:, 7], expected.views)
+    found = cloud.numpy(("x", "y", "z", "normal_x", "normal_y", "normal_z", "sigma", "views"))
+    columns = [expected.points, expected.normals, expected.sigma, expected.views]
+    np.testing.assert_array_equal(found, np.column_stack(columns))
     rgb = pypcd4.PointCloud.decode_rgb(cloud.pc_data["rgb"])
     np.testing.assert_array_equal(rgb, expected.color)
 
@@ -259,10 +251,8 @@ def test_kitti(result: Path) -> None:
 def test_export_command(result: Path, tmp_path: Path, capsys) -> None:
     assert ", ".join(FORMATS) in " ".join((Export.__doc__ or "").split())
     out = tmp_path / "new" / "files"
-    assert printed(capsys, "export", result, "las", "kitti", "--out", out).split() == [
-        str(out / "cloud.las"),
-        str(out / "trajectory.kitti.txt"),
-    ]
+    names = [str(out / name) for name in ("cloud.las", "trajectory.kitti.txt")]
+    assert printed(capsys, "export", result, "las", "kitti", "--out", out).split() == names
     before = (out / "cloud.las").read_bytes()
     (out / "cloud.las").write_bytes(b"mine")
     refuses(capsys, "export", result, "las", "--out", out, says="--overwrite")

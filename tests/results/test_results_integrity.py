@@ -70,6 +70,10 @@ def set_covariance(run: dict[str, Any], change: Callable[[np.ndarray], np.ndarra
     frame["covariance"] = change(np.reshape(frame["covariance"], (6, 6))).ravel().tolist()
 
 
+def later(run: dict[str, Any]) -> None:
+    run["frames"][1]["timestamp"] = 7e9
+
+
 def mirrored(run: dict[str, Any]) -> None:
     run["T_up_world"][0] = [-x for x in run["T_up_world"][0]]
 
@@ -89,7 +93,7 @@ def mirrored(run: dict[str, Any]) -> None:
         (lambda run: set_covariance(run, lambda C: -C), "covariance of frame"),
         (lambda run: set_covariance(run, lambda C: C + np.eye(6, k=1)), "covariance of frame"),
         (mirrored, r"run\.json: T_up_world"),
-        (lambda run: run["frames"][1].update(timestamp=7e9), "other timestamps"),
+        (later, "other timestamps"),
     ],
 )
 def test_values_that_no_run_writes_are_refused_even_sealed(result, change, problem) -> None:
@@ -122,10 +126,7 @@ def test_result_of_an_earlier_version_counts_as_edited(result) -> None:
     [
         (lambda path: path.write_text(""), "run.json"),
         (lambda path: edit(path.parent, lambda run: run.update(frames=[])), "lists 0 frames"),
-        (
-            lambda path: edit(path.parent, lambda run: run["frames"][1].update(timestamp=7e9)),
-            "other timestamps",
-        ),
+        (lambda path: edit(path.parent, later), "other timestamps"),
     ],
 )
 @pytest.mark.parametrize("place", [0, 1])
