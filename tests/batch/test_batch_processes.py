@@ -124,9 +124,7 @@ def test_bad_recording_does_not_stop_batch(room_recording: Path, tmp_path: Path,
 
 
 @pytest.mark.nightly
-def test_killed_jobs_and_batch_are_resumed(
-    batch_benchmark: ModuleType, listed: Path, single_runs: Path, tmp_path: Path
-) -> None:
+def test_killed_jobs_and_batch_are_resumed(batch_benchmark, listed, single_runs, tmp_path) -> None:
     out = tmp_path / "out"
     words = ("--workers", 2, "--retries", 10)
     batch = batch_benchmark.start_batch(listed, out, *words)
@@ -143,9 +141,7 @@ def test_killed_jobs_and_batch_are_resumed(
     assert sum(int(r["starts"]) for r in records(out)) >= 4
 
 
-def test_unreachable_scheduler_is_reported(
-    listed: Path, tmp_path: Path, monkeypatch, capsys
-) -> None:
+def test_unreachable_scheduler_is_reported(listed, tmp_path, monkeypatch, capsys) -> None:
     pytest.importorskip("distributed", reason="Dask is not installed")
     monkeypatch.setattr(cluster, "_TIMEOUT_S", 1.0)
     for address in ("tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:99999"):

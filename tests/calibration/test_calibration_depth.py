@@ -196,9 +196,7 @@ def test_wall_at_unknown_poses_reduces_wiggling_below_3_mm(views: Recording) -> 
 
 
 @pytest.mark.nightly_part
-def test_command_writes_correction_that_is_applied(
-    views: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_writes_correction_that_is_applied(views, tmp_path, capsys) -> None:
     folder = tmp_path / "rec"
     seen = [replace(f, timestamp=float(k)) for k, f in enumerate(views.select(end=12))]
     record(folder, seen, depth_unit_m=0.0001, amplitude_kind="range_compensated")

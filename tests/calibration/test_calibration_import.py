@@ -27,9 +27,7 @@ def test_size_that_the_file_lacks_is_that_of_the_recording(
     assert (lens.width, lens.height, lens.fx) == (images.width, images.height, 50)
 
 
-def test_import_command(
-    tmp_path: Path, room_recording: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_import_command(tmp_path: Path, room_recording: Path, capsys) -> None:
     source = written(tmp_path, "c.json", OPENCV.format(k=[-0.2, 0.1, 1e-3, -2e-3, 0.05]))
     out = tmp_path / "lens" / "camera.json"
     command = ["calibrate", "import", str(source), "--out", str(out)]

@@ -184,9 +184,7 @@ def _seen(camera: Camera, views: list[BoardView]) -> np.ndarray:
 
 
 @pytest.mark.nightly_part
-def test_command_writes_camera_for_readers(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_writes_camera_for_readers(tmp_path: Path, capsys) -> None:
     wrong = replace(TRUE, fx=200.0)
     seen = [replace(f, camera=wrong, timestamp=float(k)) for k, f in enumerate(frames()[:10])]
     record(tmp_path / "rec", seen, depth_unit_m=0.0001, amplitude_kind="range_compensated")

@@ -207,9 +207,7 @@ REAL: list[tuple[str, int, dict[str, Any]]] = [
 
 @pytest.mark.nightly
 @pytest.mark.parametrize(("name", "every", "how"), REAL)
-def test_real_recordings(
-    shared_data: Path, tmp_path: Path, name: str, every: int, how: dict[str, Any]
-) -> None:
+def test_real_recordings(shared_data, tmp_path, name, every, how) -> None:
     before = open_recording(shared_data / name).select(every=every)
     convert(before, tmp_path / "out")
     check_same(before, open_recording(tmp_path / "out"), **how)

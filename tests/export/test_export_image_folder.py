@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -110,9 +109,7 @@ def test_colmap_text_files(tmp_path: Path) -> None:
     assert sorted(p.name for p in (folder / "images").iterdir()) == names
 
 
-def test_colour_keeps_its_recorded_resolution(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_colour_keeps_its_recorded_resolution(tmp_path: Path, monkeypatch) -> None:
     full = np.random.default_rng(6).integers(1, 255, (72, 96, 3)).astype(np.uint8)
     monkeypatch.setattr(NativeSource, "full_resolution_color", lambda _self, _index: full)
     (folder,) = export(made_result(tmp_path, PLAIN), ["nerfstudio"])
@@ -155,9 +152,7 @@ def _longer(result: Path) -> None:
     ],
     ids=["gone", "longer", "other image", "no input", "invalid corrections"],
 )
-def test_impossible_exports_are_refused(
-    tmp_path: Path, spoil: Callable[[Path], None], says: str, capsys
-) -> None:
+def test_impossible_exports_are_refused(tmp_path, spoil, says, capsys) -> None:
     result = made_result(tmp_path, PLAIN)
     spoil(result)
     for name in ("nerfstudio", "colmap"):

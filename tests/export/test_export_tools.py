@@ -264,9 +264,7 @@ def test_missing_package_is_named_before_any_work(
     refuses(capsys, "export", result, "pcd", name, says=says)
 
 
-def test_command_writes_grids_that_belong_to_the_result(
-    result: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_writes_grids_that_belong_to_the_result(result: Path, capsys) -> None:
     words = ("export", result, *FORMATS, "--voxel", "0.1m", "--every", "2")
     names = ["occupancy.npz", "esdf.npz", "octomap.bt"]
     assert [Path(line).name for line in printed(capsys, *words).split()] == names

@@ -553,9 +553,7 @@ def test_wraps_behind_rotating_object_do_not_affect_verdict(result: tofuse.Resul
         ("lens_distortion", (0.0, 0.0, 0.0, 0.0, 0.03), (0.0, 0.0, 0.02, 0.0, 0.0)),
     ],
 )
-def test_corrected_intrinsics_do_not_affect_verdict(
-    result: tofuse.Result, code: str, harmless, severe
-) -> None:
+def test_corrected_intrinsics_do_not_affect_verdict(result, code, harmless, severe) -> None:
     wrong = Finding(code, "It is that of another camera.", "Use the right one.", {})
 
     def faults(errors: tuple[float, ...]) -> list[str]:
@@ -572,9 +570,7 @@ def test_corrected_intrinsics_do_not_affect_verdict(
 @pytest.mark.parametrize(
     ("factor", "corrected"), [(0.95, True), (0.97, True), (0.83, False), (1.05, False)]
 )
-def test_focal_length_is_corrected_only_as_finding_says(
-    result: tofuse.Result, factor: float, corrected: bool
-) -> None:
+def test_focal_length_is_corrected_only_as_finding_says(result, factor, corrected) -> None:
     """A focal length and an offset trade off: the correction may be of another amount."""
     wrong = Finding("focal_length", "Wrong.", "Use it.", {"factor": factor, "sigma": 0.01})
     calibrated = SelfCalibration(0.05, 0.1, 0.0, 0.0, 0.0, {"focal": 0.002}, (0.1, 0.01))

@@ -431,9 +431,7 @@ def test_what_is_missing_is_named(tmp_path, topic, lens, says) -> None:
     [("ros1", "BZ2"), ("ros1", "LZ4"), ("mcap", "STORAGE"), ("mcap", "MESSAGE"),
      ("ros2", "MESSAGE"), ("ros2", "FILE"), ("mcap", "FILE")],
 )  # fmt: skip
-def test_compressed_bags(
-    tmp_path: Path, kind: str, packed: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_compressed_bags(tmp_path: Path, kind: str, packed: str, monkeypatch) -> None:
     """Compressed files are decompressed into a temporary folder, which is removed."""
     (temporary := tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
@@ -446,9 +444,7 @@ def test_compressed_bags(
     assert list(temporary.iterdir()) == []
 
 
-def test_missing_rosbags_is_reported_with_remedy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_rosbags_is_reported_with_remedy(tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(4096))
 
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)

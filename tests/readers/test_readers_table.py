@@ -311,9 +311,7 @@ DAMAGED: list[tuple[str, Change, str | tuple[int, ...], str]] = [
 
 
 @pytest.mark.parametrize(("name", "change", "outcome", "says"), DAMAGED)
-def test_damage_is_reported(
-    tmp_path: Path, name: str, change: Change, outcome: str | tuple[int, ...], says: str
-) -> None:
+def test_damage_is_reported(tmp_path, name, change, outcome, says) -> None:
     path, format_ = made(name, tmp_path)
     change(tmp_path / path)
     if outcome == REFUSED:

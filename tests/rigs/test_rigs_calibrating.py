@@ -136,9 +136,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.nightly
-def test_displaced_camera_is_found(
-    calibrated: Calibration, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_displaced_camera_is_found(calibrated: Calibration, tmp_path: Path, capsys) -> None:
     folder = written(tmp_path / "rig", 1)
     cameras = [str(folder / f"cam{k}") for k in range(3)]
     rig = calibrated.rig
