@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from cli_calls import printed, refuses
+from refused import refused
 from tofuse.apps.calibration.board import Board
 from tofuse.apps.calibration.depth import DepthFit, calibrate_depth
 from tofuse.apps.calibration.plane_views import PlaneView, board_planes, scene_planes
 from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.errors import InputError
 from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry.rays import unit_rays
 from tofuse.formats.cameras.calibration_files import read_correction
@@ -155,8 +155,7 @@ def test_single_distance_is_rejected() -> None:
     views = [
         replace(view, measured_m=1.0 + 0.01 * view.measured_m) for view in made_views(known=True)
     ]
-    with pytest.raises(InputError, match="several distances"):
-        calibrate_depth(views, CAMERA)
+    refused("several distances", views, CAMERA, by=calibrate_depth)
 
 
 EFFECTS = Effects(wiggling=2.6, thermal_drift=0.0).without("multipath", "mixed_pixels")
@@ -228,5 +227,4 @@ def test_real_sr4000_from_two_places_is_rejected(shared_data: Path) -> None:
     # The end of the corridor is nearer by 0.3 m from the second place.
     far = {view.frame // 4: r for view, r in zip(found, ranges, strict=True) if r > 4}
     assert far[0] - far[1] == pytest.approx(0.31, abs=0.04)
-    with pytest.raises(InputError, match="20 places"):
-        calibrate_depth(found, camera)
+    refused("20 places", found, camera, by=calibrate_depth)

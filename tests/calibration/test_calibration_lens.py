@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from cli_calls import printed, refuses
+from refused import refused
 from tofuse.apps.calibration import lens
 from tofuse.apps.calibration.board import Board, board_pose, find_corners
 from tofuse.apps.calibration.lens import BoardView, LensFit, calibrate_lens
@@ -149,8 +150,7 @@ def test_degenerate_viewpoints_are_rejected(monkeypatch: pytest.MonkeyPatch) -> 
     camera = Pinhole(320, 240, 250, 250, 160, 120)
     views = views_of(camera, poses_facing(12, 0.01))
     monkeypatch.setattr(lens, "board_views", lambda *_: (views, [], camera))
-    with pytest.raises(InputError, match="tilt it by 20 to 40 degrees"):
-        calibrate_lens(recording_of(frames()[:1]), BOARD)
+    refused("tilt it by 20 to 40 degrees", recording_of(frames()[:1]), BOARD, by=calibrate_lens)
 
 
 @pytest.mark.parametrize(

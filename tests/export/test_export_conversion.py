@@ -185,8 +185,7 @@ def test_failed_conversion_leaves_nothing(tmp_path: Path, monkeypatch) -> None:
             convert(recording, tmp_path / "out")
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
     (tmp_path / "file").write_text("x")
-    with pytest.raises(OutputError, match="is a file"):
-        convert(recording, tmp_path / "file")
+    refused("is a file", recording, tmp_path / "file", by=convert, error=OutputError)
     shutil.rmtree(tmp_path / "out", ignore_errors=True)
     (tmp_path / "out").mkdir()
     assert convert(recording, tmp_path / "out").frames == 3

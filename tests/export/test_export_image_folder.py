@@ -16,6 +16,7 @@ import pytest
 
 from cli_calls import refuses
 from posed_results import BROWN, DISTANCE, NORMAL, POSED, POSES, SIZE, made_result, plane
+from refused import refused
 from tofuse.apps.export.exporting import export
 from tofuse.apps.results.run_json import read_run_json
 from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
@@ -163,8 +164,7 @@ def test_impossible_exports_are_refused(tmp_path, spoil, says, capsys) -> None:
 def test_only_own_folders_are_replaced(tmp_path: Path) -> None:
     result = made_result(tmp_path, PLAIN)
     (folder,) = export(result, ["colmap"])
-    with pytest.raises(OutputError, match="pass overwrite"):
-        export(result, ["colmap"])
+    refused("pass overwrite", result, ["colmap"], by=export, error=OutputError)
     (folder / "images" / "frame_000001.png").unlink()
     export(result, ["colmap"], overwrite=True)
     assert (folder / "images" / "frame_000001.png").is_file()

@@ -14,8 +14,8 @@ import tofuse
 from cli_calls import call, listing, printed, refuses
 from made_rooms import OTHER, at, seen
 from made_sessions import HERE, recorded
+from refused import refused
 from tofuse.apps.jobs import locating
-from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
@@ -211,8 +211,7 @@ def test_cloud_is_registered_with_points_of_the_map(session_results, tmp_path, c
 
 def test_python_refuses_cloud(here) -> None:
     cloud = CloudFrame(0, 0.0, np.zeros((20, 3), np.float32))
-    with pytest.raises(InputError, match=r"is a cloud.*tofuse\.register"):
-        here.locate(cloud)
+    refused(r"is a cloud.*tofuse\.register", cloud, by=here.locate)
 
 
 def test_missing_recording_is_named(session_results, clip, tmp_path, capfd) -> None:

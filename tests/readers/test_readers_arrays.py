@@ -147,5 +147,4 @@ def test_arrays_that_hold_no_depth_in_mm_or_are_elsewhere() -> None:
         def __iter__(self):
             raise TypeError("can't convert cuda:0 device type tensor to numpy: use Tensor.cpu()")
 
-    with pytest.raises(InputError, match=r"not an array of images .*use Tensor\.cpu\(\)"):
-        tofuse.from_arrays(Tensor(), K)
+    refused(r"not an array of images .*use Tensor\.cpu\(\)", Tensor(), K, by=tofuse.from_arrays)

@@ -517,8 +517,7 @@ def test_map_coordinates_that_floats_round_are_refused(tmp_path: Path) -> None:
         write_ply(tmp_path / "a.ply", GeometryRecord(points.astype(np.float32)))
         if place[1] == 5e6 and factor == 1:
             refused(r"a.ply: .* 32-bit floats round to 0.5 m", tmp_path)
-            with pytest.raises(InputError, match="double precision"):
-                CloudFrame.of(points.astype(np.float32))
+            refused("double precision", points.astype(np.float32), by=CloudFrame.of)
         else:
             assert len(open_recording(tmp_path)[0]) == 40
 

@@ -19,7 +19,7 @@ from posed_results import POSES as EXPORTED_POSES
 from refused import refused
 from tofuse.apps.export.exporting import export
 from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole
-from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.errors import UnreadableFrameError
 from tofuse.formats.images.images import parse_image
 from tofuse.formats.recordings.open import open_recording
 
@@ -185,8 +185,7 @@ def test_pgm() -> None:
     small = b"P5 # made by hand\n3 2\n# twice\n255\n" + bytes(range(6))
     np.testing.assert_array_equal(parse_image(small, "a.pgm"), np.arange(6).reshape(2, 3))
     for bad in (b"", b"P2\n1 1\n1\n1", b"P5\n0 2\n255\n", b"P5\n99999 99999\n255\n", small[:-1]):
-        with pytest.raises(InputError, match=r"a\.pgm"):
-            parse_image(bad, "a.pgm")
+        refused(r"a\.pgm", bad, "a.pgm", by=parse_image)
 
 
 @pytest.mark.parametrize(

@@ -109,8 +109,7 @@ def test_other_arrays_as_depth_are_refused(tmp_path: Path, saved: Any, words: st
     folder = write(tmp_path / "r", 1)
     (folder / "depth" / "000000.png").unlink()
     np.save(folder / "depth" / "000000.npy", saved)
-    with pytest.raises(UnreadableFrameError, match=words):
-        NativeSource(folder).read(0)
+    refused(words, 0, by=NativeSource(folder).read, error=UnreadableFrameError)
     np.save(folder / "depth" / "000000.npy", np.ones((40, 30)))
     refused(r"000000.npy: is 30 x 40 pixels, camera.json states", folder)
 
@@ -343,8 +342,7 @@ def test_damaged_frame_is_an_unreadable_frame(tmp_path: Path) -> None:
     assert len(source.read(0))
     broken = ["depth/000001.png", "depth/000002.png", "amplitude/000003.png"]
     for k, name in enumerate([*broken, "confidence/000004.png"], 1):
-        with pytest.raises(UnreadableFrameError, match=name):
-            source.read(k)
+        refused(name, k, by=source.read, error=UnreadableFrameError)
 
 
 def test_frames_with_damaged_colour_are_used_without_it(tmp_path: Path) -> None:
@@ -408,24 +406,19 @@ def test_color_for_display_may_have_any_size(tmp_path: Path) -> None:
 
 def test_writer_refuses_invalid_frames(tmp_path: Path) -> None:
     writer = RecordingWriter(tmp_path / "a", PINHOLE)
-    with pytest.raises(InputError, match="no frames"):
-        writer.finish()
+    refused("no frames", by=writer.finish)
     writer.add(image(0))
-    with pytest.raises(InputError, match="channels"):
-        writer.add(image(1, color_image=None))
+    refused("channels", image(1, color_image=None), by=writer.add)
     with pytest.raises(InputError, match="40 x 31"):
         writer.add(
             RangeFrame(1, 0.0, Pinhole(40, 31, 30.0, 30.0, 0.0, 0.0), np.ones((31, 40), np.float32))
         )
-    with pytest.raises(InputError, match="cloud"):
-        writer.add(CloudFrame.of(np.zeros((3, 3))))
-    with pytest.raises(InputError, match="poses"):
-        writer.finish(groundtruth=np.zeros((2, 4, 4)))
+    refused("cloud", CloudFrame.of(np.zeros((3, 3))), by=writer.add)
+    refused("poses", by=writer.finish, groundtruth=np.zeros((2, 4, 4)))
     # At this point the folder is not a recording yet.
     refused(r"camera\.json", tmp_path / "a")
     writer.finish()
-    with pytest.raises(OutputError, match="isn't empty"):
-        RecordingWriter(tmp_path / "a", PINHOLE)
+    refused("isn't empty", tmp_path / "a", PINHOLE, by=RecordingWriter, error=OutputError)
 
 
 def test_same_frames_give_same_bytes(tmp_path: Path) -> None:

@@ -406,8 +406,7 @@ def test_iteration_raises_at_unreadable_frame() -> None:
     _, recording = counting(5, 3)
     iterator = iter(recording)
     assert [next(iterator).index for _ in range(3)] == [0, 1, 2]
-    with pytest.raises(UnreadableFrameError, match="frame 3"):
-        next(iterator)
+    refused("frame 3", iterator, by=next, error=UnreadableFrameError)
 
 
 def test_read_ahead_is_bounded_and_stops_early() -> None:
@@ -425,8 +424,7 @@ def test_other_errors_are_raised_from_thread() -> None:
             raise InputError("breaks down")
 
     source = Broken([CloudFrame.of(np.ones((3, 3)))])
-    with pytest.raises(InputError, match="breaks down"):
-        list(Recording.of(source, "memory", "array").read_all())
+    refused("breaks down", Recording.of(source, "memory", "array").read_all(), by=list)
     assert reader_threads() == []
 
 

@@ -14,6 +14,7 @@ import pytest
 
 import tofuse
 from cli_calls import refuses
+from refused import refused
 from tofuse.apps.cli.program import main
 from tofuse.apps.results import integrity, load_result, run_json
 from tofuse.engine.errors import InputError
@@ -46,8 +47,7 @@ def test_every_file_has_its_digest(result) -> None:
 @pytest.mark.parametrize("name", ["trajectory.txt", "pose_graph.g2o", "cloud.ply", "mesh.ply"])
 def test_edited_file_is_refused_by_name_or_accepted(result, name, capfd) -> None:
     (result / name).write_bytes((result / name).read_bytes().replace(b"1", b"2", 1))
-    with pytest.raises(InputError, match=f"{name} was changed after the run"):
-        tofuse.load(result)
+    refused(f"{name} was changed after the run", result, by=tofuse.load)
     refuses(capfd, "export", result, "pcd", says=f"{name} was changed after the run")
     assert main(["export", str(result), "pcd", "--edited"]) == 0
 
@@ -55,8 +55,7 @@ def test_edited_file_is_refused_by_name_or_accepted(result, name, capfd) -> None
 def test_edited_run_json_is_refused_or_accepted(result) -> None:
     path = result / "run.json"
     path.write_text(path.read_text().replace('"tracked"', '"predicted"', 1))
-    with pytest.raises(InputError, match=r"run\.json was changed after the run"):
-        load_result(result)
+    refused(r"run\.json was changed after the run", result, by=load_result)
     assert tofuse.load(result, edited=True).diagnostics.frames[0].status == "predicted"
 
 
@@ -99,8 +98,7 @@ def mirrored(run: dict[str, Any]) -> None:
 def test_values_that_no_run_writes_are_refused_even_sealed(result, change, problem) -> None:
     edit(result, change)
     for accepted in (False, True):
-        with pytest.raises(InputError, match=problem):
-            tofuse.load(result, edited=accepted)
+        refused(problem, result, by=tofuse.load, edited=accepted)
 
 
 def test_reversed_trajectory_is_refused_even_if_edits_are_accepted(result) -> None:
@@ -115,8 +113,7 @@ def test_result_of_an_earlier_version_counts_as_edited(result) -> None:
     run = json.loads(path.read_text())
     del run["sha256"]
     path.write_text(json.dumps(run))
-    with pytest.raises(InputError, match=r"run\.json was changed"):
-        load_result(result)
+    refused(r"run\.json was changed", result, by=load_result)
     with integrity.accepting_edits(), run_json.opened(result) as found:
         assert found == run
 
@@ -135,5 +132,4 @@ def test_contradictory_result_is_not_evaluated(result, tmp_path, change, problem
     sources = [result, reference] if place == 0 else [reference, result]
     assert tofuse.evaluate(*sources).error.ate_rms_m < 1e-6
     change(result / "run.json")
-    with pytest.raises(InputError, match=problem):
-        tofuse.evaluate(*sources)
+    refused(problem, *sources, by=tofuse.evaluate)

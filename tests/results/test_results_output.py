@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from made_results import contents, result, torn
+from refused import refused
 from tofuse.apps.export.exporting import export
 from tofuse.apps.jobs.running import exit_status
 from tofuse.apps.results import output
@@ -19,7 +20,7 @@ from tofuse.apps.results.folders import OutputFolder, check_result, component_nu
 from tofuse.apps.results.loading import load_result
 from tofuse.apps.results.output import write_result
 from tofuse.apps.results.run_json import frames_in_main_model, read_run_json
-from tofuse.engine.errors import InputError, OutputError
+from tofuse.engine.errors import OutputError
 from tofuse.engine.results.types import FrameRecord
 from tofuse.formats.files.staging import beside
 from tofuse.formats.geometry.pcd import read_pcd
@@ -82,10 +83,8 @@ def test_foreign_folder_is_unchanged(tmp_path, name, overwrite) -> None:
 def test_file_as_folder_or_parent_is_refused(tmp_path) -> None:
     file = tmp_path / "file"
     file.write_text("mine")
-    with pytest.raises(OutputError, match="is a file; choose a folder"):
-        OutputFolder(file)
-    with pytest.raises(OutputError, match="can't be written"):
-        OutputFolder(file / "below")
+    refused("is a file; choose a folder", file, by=OutputFolder, error=OutputError)
+    refused("can't be written", file / "below", by=OutputFolder, error=OutputError)
     assert file.read_text() == "mine"
 
 
@@ -136,8 +135,7 @@ def test_failure_while_moving_is_rolled_back_and_keeps_new_result(tmp_path, monk
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", fail)
         words = r"can.t be written .permission denied.*; move the new result, .* from .*tofuse-new-"
-        with pytest.raises(OutputError, match=words):
-            write_result(torn(seed=1), folder)
+        refused(words, torn(seed=1), folder, by=write_result, error=OutputError)
     assert contents(out) == before
     assert set(contents(new)) == BOTH
     assert read_run_json(new / "run.json")["seed"] == 1
@@ -264,12 +262,8 @@ def test_folder_with_foreign_files_is_kept(tmp_path, name, when) -> None:
 def test_invalid_run_json(tmp_path, text, message) -> None:
     file = tmp_path / "run.json"
     file.write_text(text, encoding="latin-1")
-    with pytest.raises(InputError, match=message):
-        read_run_json(file)
+    refused(message, file, by=read_run_json)
     assert not is_result(tmp_path)
-    with pytest.raises(InputError, match=r"run\.json: is damaged, or not a run\.json of tofuse"):
-        check_result(tmp_path)
-    with pytest.raises(InputError, match="doesn't exist"):
-        read_run_json(tmp_path / "none.json")
-    with pytest.raises(InputError, match="is a folder"):
-        read_run_json(tmp_path)
+    refused(r"run\.json: is damaged, or not a run\.json of tofuse", tmp_path, by=check_result)
+    refused("doesn't exist", tmp_path / "none.json", by=read_run_json)
+    refused("is a folder", tmp_path, by=read_run_json)

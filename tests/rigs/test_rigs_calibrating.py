@@ -11,6 +11,7 @@ import pytest
 import tofuse
 from cli_calls import printed, refuses
 from pose_errors import assert_near
+from refused import refused
 from rig_room import ROOM
 from rig_scene import CAMERA, looked_at
 from tofuse.apps.cli.program import main
@@ -172,8 +173,7 @@ def test_rig_is_not_taken_for_one_camera(tmp_path: Path, capsys) -> None:
     recording = open_recording(folder)
     poses = np.tile(np.eye(4), (len(recording), 1, 1))
     for use in (tofuse.inspect, tofuse.reconstruct, lambda r: tofuse.judge(r, poses)):
-        with pytest.raises(InputError, match="is a rig of several cameras"):
-            use(recording)
+        refused("is a rig of several cameras", recording, by=use)
     for words in (["inspect"], ["noise"], ["calibrate", "depth"]):
         refuses(capsys, *words, folder, says="is a rig of several cameras")
 
