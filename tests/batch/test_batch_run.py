@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from cli_calls import refuses
 from refused import refused
 from tofuse.apps.batch.batch import pending, run_batch, status_of
 from tofuse.apps.batch.cluster import DaskWorkers
@@ -20,7 +21,6 @@ from tofuse.apps.batch.folder import BatchFolder, Record
 from tofuse.apps.batch.jobs import Job
 from tofuse.apps.batch.table import COLUMNS, write_table
 from tofuse.apps.batch.work import Task, Workers
-from tofuse.apps.cli.program import main
 from tofuse.engine.errors import InputError, OutputError
 
 Outcome = Callable[[Task], Record]
@@ -286,15 +286,8 @@ def test_dask_outcomes_are_translated() -> None:
 )
 def test_invalid_arguments_are_reported(words, text, tmp_path: Path, capsys) -> None:
     (tmp_path / "list.txt").write_text(f"{tmp_path}\n")
-    line = ["batch", str(tmp_path / "list.txt"), "--out", str(tmp_path / "out"), *words]
-    try:
-        status = main(line)
-    except SystemExit as end:
-        status = end.code
-    assert status == 2
-    found = capsys.readouterr().err
-    assert text in found
-    assert found.count("\n") == 1
+    line = ("batch", tmp_path / "list.txt", "--out", tmp_path / "out", *words)
+    refuses(capsys, *line, says=text, prefix="tofuse")
     assert not (tmp_path / "out").exists()
 
 

@@ -87,23 +87,15 @@ def test_hostile_environments_give_result_or_one_line_error(
 
 
 def shell(script: str) -> tuple[int, str]:
-    begin = f"{sys.executable} -m tofuse"
-    done = subprocess.run(
-        ["/bin/bash", "-c", script.replace("tofuse", begin, 1)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    words = ["/bin/bash", "-c", script.replace("tofuse", f"{sys.executable} -m tofuse", 1)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
     return done.returncode, done.stderr
 
 
 @pytest.mark.nightly_part
 def test_unwritable_stdout_is_reported(clouds: Path) -> None:
-    status, stderr = shell(f"tofuse inspect {clouds} > /dev/full")
-    assert (status, stderr) == (
-        2,
-        "tofuse: standard output: can't be written (no space left on device)\n",
-    )
+    full = "tofuse: standard output: can't be written (no space left on device)\n"
+    assert shell(f"tofuse inspect {clouds} > /dev/full") == (2, full)
     assert shell("tofuse --help > /dev/full")[0] == 2
     status, stderr = shell(f"tofuse inspect {clouds} | true; exit ${{PIPESTATUS[0]}}")
     assert status in (0, 141)  # it may be read before the reader ends

@@ -21,14 +21,7 @@ from written import change_camera
 def recording(room_recording, tmp_path) -> Path:
     """A copy of the recording with four frames, to be broken."""
     copy = tmp_path / "rec"
-    keep = {f"{k:06d}" for k in range(4)}
-    shutil.copytree(
-        room_recording,
-        copy,
-        ignore=lambda _folder, names: [
-            n for n in names if n == "truth" or (n.endswith(".png") and n[:6] not in keep)
-        ],
-    )
+    shutil.copytree(room_recording, copy, ignore=shutil.ignore_patterns("truth", "00000[4-7].png"))
     for name in ("groundtruth.txt", "timestamps.txt", "frames.csv"):
         (copy / name).unlink()
     return copy
@@ -96,10 +89,7 @@ def test_unreadable_files_are_rejected(recording, tmp_path, capfd, monkeypatch) 
 
     for name in ("open", "read_bytes"):
         monkeypatch.setattr(Path, name, refusing(getattr(Path, name)))
-    message = refuses(
-        capfd, "run", recording, "--out", tmp_path / "out", says=("rec", "ermission denied")
-    )
-    assert "Traceback" not in message
+    refuses(capfd, "run", recording, "--out", tmp_path / "out", says=("rec", "ermission denied"))
     assert not (tmp_path / "out").exists()
 
 
@@ -138,9 +128,8 @@ def test_unwritable_output_is_reported(code, recording, tmp_path, capfd, monkeyp
     monkeypatch.setattr(Path, "open", full)
     before = listing(tmp_path)
     out = tmp_path / "out"
-    message = refuses(
-        capfd, "run", recording, "--out", out, says=(str(tmp_path), "can't be written")
-    )
+    words = ("run", recording, "--out", out)
+    message = refuses(capfd, *words, says=(str(tmp_path), "can't be written"))
     assert os.strerror(code).lower() in message.lower()
     assert ".tofuse" not in message
     assert listing(tmp_path) == before
