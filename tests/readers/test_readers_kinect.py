@@ -102,9 +102,9 @@ def test_color_is_registered_and_occluded_points_have_none(tmp_path: Path) -> No
     frame = open_recording(tmp_path / "a.mkv")[0]
     assert frame.color_image is not None
     points = frame.point_image.reshape(-1, 3).astype(float)
-    cx, cy, fx, fy, *k = made.COLOR_LENS
+    cx, cy, fx, fy, *_ = made.COLOR_LENS
     K = np.array([[fx * 1280, 0, cx * 1280 - 0.5], [0, fy * 960, cy * 960 - 120.5], [0, 0, 1]])
-    distortion = np.array([k[0], k[1], k[9], k[8], k[2], k[3], k[4], k[5]])
+    _, distortion = opencv_lens("NFOV_UNBINNED", made.COLOR_LENS)
     uv = cv2.projectPoints(points, np.zeros(3), np.array(made.BASELINE), K, distortion)[0]
     uv = uv.reshape(288, 320, 2)
     seen = frame.color_image[..., 2] > 150

@@ -374,8 +374,9 @@ def test_permission_denied_is_one_line(tmp_path: Path, monkeypatch: pytest.Monke
 class Counting(ArraySource):
     """Counts reads; the frames in `bad` can't be read."""
 
-    bad: tuple[int, ...] = ()
-    reads = 0
+    def __init__(self, count: int, *bad: int) -> None:
+        super().__init__([CloudFrame.of(np.ones((3, 3)), index=k) for k in range(count)])
+        self.bad, self.reads = bad, 0
 
     def read(self, index: int) -> Frame:
         self.reads += 1
@@ -383,11 +384,8 @@ class Counting(ArraySource):
             raise UnreadableFrameError("is bad", where=f"frame {index}")
         return super().read(index)
 
-
-def counting(count: int, *bad: int) -> tuple[Counting, Recording]:
-    source = Counting([CloudFrame.of(np.ones((3, 3)), index=k) for k in range(count)])
-    source.bad = bad
-    return source, Recording.of(source, "memory", "array")
+    def recording(self) -> Recording:
+        return Recording.of(self, "memory", "array")
 
 
 def reader_threads() -> list[threading.Thread]:
@@ -395,23 +393,21 @@ def reader_threads() -> list[threading.Thread]:
 
 
 def test_frames_come_in_order_with_errors_in_place() -> None:
-    _, recording = counting(50, 3, 49)
-    items = list(recording.select(1, None, 2).read_all(ahead=3))
+    items = list(Counting(50, 3, 49).recording().select(1, None, 2).read_all(ahead=3))
     found = [item.index if isinstance(item, CloudFrame) else str(item) for item in items]
     assert found == [1, "frame 3: is bad", *range(5, 49, 2), "frame 49: is bad"]
     assert reader_threads() == []
 
 
 def test_iteration_raises_at_unreadable_frame() -> None:
-    _, recording = counting(5, 3)
-    iterator = iter(recording)
+    iterator = iter(Counting(5, 3).recording())
     assert [next(iterator).index for _ in range(3)] == [0, 1, 2]
     refused("frame 3", iterator, by=next, error=UnreadableFrameError)
 
 
 def test_read_ahead_is_bounded_and_stops_early() -> None:
-    source, recording = counting(1000)
-    iterator = recording.read_all(ahead=4)
+    source = Counting(1000)
+    iterator = source.recording().read_all(ahead=4)
     next(iterator)
     iterator.close()
     assert source.reads <= 7
@@ -423,8 +419,7 @@ def test_other_errors_are_raised_from_thread() -> None:
         def read(self, index: int) -> Frame:
             raise InputError("breaks down")
 
-    source = Broken([CloudFrame.of(np.ones((3, 3)))])
-    refused("breaks down", Recording.of(source, "memory", "array").read_all(), by=list)
+    refused("breaks down", Broken(1).recording().read_all(), by=list)
     assert reader_threads() == []
 
 
@@ -438,9 +433,8 @@ def test_two_readers_keep_the_order() -> None:
             time.sleep(0.003 if index % 2 == 0 else 0.0)
             return super().read(index)
 
-    source = Uneven([CloudFrame.of(np.ones((3, 3)), index=k) for k in range(40)])
-    items = list(Recording.of(source, "memory", "array").read_all())
-    assert [item.index for item in items if isinstance(item, CloudFrame)] == list(range(40))
+    source = Uneven(40)
+    assert [item.index for item in source.recording().read_all()] == list(range(40))
     assert len(source.names) == 2
     assert reader_threads() == []
 
