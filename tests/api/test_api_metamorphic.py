@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import tofuse
-from tofuse.apps.cli.program import main
+from cli_calls import refuses
 from tofuse.apps.export import export
 from tofuse.apps.results import load_result
 from tofuse.engine.frames import CloudFrame, map_shift
@@ -242,8 +242,7 @@ def test_depth_in_map_coordinates_needs_sensor(tmp_path, capsys) -> None:
     with pytest.raises(tofuse.InputError, match=r"frame 0: is in map coordinates.*max_depth"):
         tofuse.open(tmp_path / "in", max_depth=5.0)[0]
     arguments = ["run", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--max-depth", "5"]
-    assert main(arguments) == 2
-    assert "frame 0: is in map coordinates" in capsys.readouterr().err
+    refuses(capsys, *arguments, says="frame 0: is in map coordinates")
     assert not (tmp_path / "out").exists()
     seen = CloudFrame.of(SOURCE + MAP, origin=MAP)
     np.testing.assert_allclose(seen.radial_range, np.linalg.norm(SOURCE, axis=1), atol=1e-3)

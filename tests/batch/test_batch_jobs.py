@@ -84,9 +84,7 @@ def test_invalid_lists_are_rejected(name: str, text: str, message: str, recordin
     assert str(caught.value).startswith(str(recordings / name))
 
 
-def test_recordings_globs_and_lists_are_given_together(
-    recordings: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_recordings_globs_and_lists_are_given_together(recordings: Path, monkeypatch) -> None:
     """Arguments are relative to the current folder, lines of a list to that of the list."""
     monkeypatch.chdir(recordings / "a")
     (recordings / "one.bag").write_bytes(b"#ROSBAG\0")

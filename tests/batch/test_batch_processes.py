@@ -15,6 +15,7 @@ from types import ModuleType
 
 import pytest
 
+from cli_calls import printed, refuses
 from paths import BENCHMARKS
 from tofuse.apps.batch import cluster
 from tofuse.apps.cli.program import main
@@ -97,8 +98,7 @@ def test_bad_recording_does_not_stop_batch(room_recording: Path, tmp_path: Path,
     output = capsys.readouterr().err
     assert "none of 1 recordings gave a result; nothing: " in output
     assert output.count("\n") == 1
-    assert main([*words, "--print-jobs"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = printed(capsys, *words, "--print-jobs").splitlines()
     assert [shlex.split(line)[-1] for line in lines] == ["nothing", room_recording.name]
 
     assert main(words) == 3
@@ -124,9 +124,7 @@ def test_bad_recording_does_not_stop_batch(room_recording: Path, tmp_path: Path,
 
 
 @pytest.mark.nightly
-def test_killed_jobs_and_batch_are_resumed(
-    batch_benchmark: ModuleType, listed: Path, single_runs: Path, tmp_path: Path
-) -> None:
+def test_killed_jobs_and_batch_are_resumed(batch_benchmark, listed, single_runs, tmp_path) -> None:
     out = tmp_path / "out"
     words = ("--workers", 2, "--retries", 10)
     batch = batch_benchmark.start_batch(listed, out, *words)
@@ -143,20 +141,12 @@ def test_killed_jobs_and_batch_are_resumed(
     assert sum(int(r["starts"]) for r in records(out)) >= 4
 
 
-def test_unreachable_scheduler_is_reported(
-    listed: Path, tmp_path: Path, monkeypatch, capsys
-) -> None:
+def test_unreachable_scheduler_is_reported(listed, tmp_path, monkeypatch, capsys) -> None:
     pytest.importorskip("distributed", reason="Dask is not installed")
     monkeypatch.setattr(cluster, "_TIMEOUT_S", 1.0)
-    for address in ("tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:99999"):
-        words = ["batch", str(listed), "--out", str(tmp_path / "out"), "--scheduler", address]
-        assert main(words) == 2
-        output = capsys.readouterr().err
-        assert output.startswith(f"tofuse: {address}: no Dask scheduler answers; start one")
-        assert output.count("\n") == 1
-    words = ["batch", str(listed), "--out", str(tmp_path / "out"), "--scheduler", str(listed)]
-    assert main(words) == 2
-    assert f"{listed}: no Dask scheduler answers" in capsys.readouterr().err
+    words = ("batch", listed, "--out", tmp_path / "out", "--scheduler")
+    for address in ("tcp://127.0.0.1:1", "nonsense://x", "127.0.0.1:99999", str(listed)):
+        refuses(capsys, *words, address, says=f"tofuse: {address}: no Dask scheduler answers; ")
     assert not (tmp_path / "out").exists()
 
 

@@ -13,13 +13,14 @@ from types import SimpleNamespace
 
 import pytest
 
+from cli_calls import refuses
+from refused import refused
 from tofuse.apps.batch.batch import pending, run_batch, status_of
 from tofuse.apps.batch.cluster import DaskWorkers
 from tofuse.apps.batch.folder import BatchFolder, Record
 from tofuse.apps.batch.jobs import Job
 from tofuse.apps.batch.table import COLUMNS, write_table
 from tofuse.apps.batch.work import Task, Workers
-from tofuse.apps.cli.program import main
 from tofuse.engine.errors import InputError, OutputError
 
 Outcome = Callable[[Task], Record]
@@ -143,8 +144,7 @@ def test_degraded_job_sets_exit_status(folder: BatchFolder) -> None:
 def test_batch_resumes_after_lost_workers(folder: BatchFolder) -> None:
     workers = Scripted({"b": [cancelled], "c": [cancelled]})
     workers.gone = InputError("the scheduler went away")
-    with pytest.raises(InputError, match="went away"):
-        run(folder, workers)
+    refused("went away", folder, workers, by=run)
     assert [row["name"] for row in table(folder)] == ["a"]
     again = Scripted()
     run(folder, again)
@@ -177,8 +177,7 @@ def test_foreign_result_is_not_replaced(folder: BatchFolder) -> None:
     (strange / ".tofuse-unfinished").mkdir()  # from a killed run
     assert pending(JOBS, folder, overwrite=False) == list(JOBS)
     (strange / "run.json").write_text("{}")
-    with pytest.raises(OutputError, match="pass overwrite"):
-        pending(JOBS, folder, overwrite=False)
+    refused("pass overwrite", JOBS, folder, by=pending, error=OutputError, overwrite=False)
 
 
 @pytest.mark.parametrize(
@@ -188,8 +187,7 @@ def test_damaged_record_is_named_or_replaced(damage: str, folder: BatchFolder) -
     run(folder, Scripted())
     (folder.jobs / "a.json").write_text(damage)
     assert folder.record(JOBS[0]) is None
-    with pytest.raises(OutputError, match=r"a\.json, is damaged"):
-        pending(JOBS, folder, overwrite=False)
+    refused(r"a\.json, is damaged", JOBS, folder, by=pending, error=OutputError, overwrite=False)
     assert pending(JOBS, folder, overwrite=True) == [JOBS[0]]
 
 
@@ -202,11 +200,9 @@ def test_changed_result_is_recomputed(folder: BatchFolder) -> None:
 
 def test_foreign_folder_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "note.txt").write_text("mine")
-    with pytest.raises(OutputError, match="contains no earlier batch"):
-        BatchFolder(tmp_path).prepare()
+    refused("contains no earlier batch", by=BatchFolder(tmp_path).prepare, error=OutputError)
     assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
-    with pytest.raises(OutputError, match="is a file"):
-        BatchFolder(tmp_path / "note.txt").prepare()
+    refused("is a file", by=BatchFolder(tmp_path / "note.txt").prepare, error=OutputError)
 
 
 def test_page_escapes_html(folder: BatchFolder) -> None:
@@ -227,8 +223,7 @@ def test_full_disk_is_reported(folder: BatchFolder, monkeypatch) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("tofuse.formats.files.atomic.os.replace", full)
-    with pytest.raises(OutputError, match="no space left on device"):
-        run(folder, Scripted())
+    refused("no space left on device", folder, Scripted(), by=run, error=OutputError)
 
 
 class Remote:
@@ -291,15 +286,8 @@ def test_dask_outcomes_are_translated() -> None:
 )
 def test_invalid_arguments_are_reported(words, text, tmp_path: Path, capsys) -> None:
     (tmp_path / "list.txt").write_text(f"{tmp_path}\n")
-    line = ["batch", str(tmp_path / "list.txt"), "--out", str(tmp_path / "out"), *words]
-    try:
-        status = main(line)
-    except SystemExit as end:
-        status = end.code
-    assert status == 2
-    found = capsys.readouterr().err
-    assert text in found
-    assert found.count("\n") == 1
+    line = ("batch", tmp_path / "list.txt", "--out", tmp_path / "out", *words)
+    refuses(capsys, *line, says=text, prefix="tofuse")
     assert not (tmp_path / "out").exists()
 
 

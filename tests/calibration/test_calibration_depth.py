@@ -9,22 +9,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cli_calls import printed, refuses
+from refused import refused
 from tofuse.apps.calibration.board import Board
 from tofuse.apps.calibration.depth import DepthFit, calibrate_depth
 from tofuse.apps.calibration.plane_views import PlaneView, board_planes, scene_planes
 from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.errors import InputError
 from tofuse.engine.frames.recording import Recording
 from tofuse.engine.geometry.rays import unit_rays
 from tofuse.formats.cameras.calibration_files import read_correction
-from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.scenes import checkerboard
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.sensor import factory_correction
+from written import record
 
 BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)
 CAMERA = Pinhole(48, 36, 45.0, 45.0, 23.5, 17.5)
@@ -154,8 +155,7 @@ def test_single_distance_is_rejected() -> None:
     views = [
         replace(view, measured_m=1.0 + 0.01 * view.measured_m) for view in made_views(known=True)
     ]
-    with pytest.raises(InputError, match="several distances"):
-        calibrate_depth(views, CAMERA)
+    refused("several distances", views, CAMERA, by=calibrate_depth)
 
 
 EFFECTS = Effects(wiggling=2.6, thermal_drift=0.0).without("multipath", "mixed_pixels")
@@ -195,37 +195,27 @@ def test_wall_at_unknown_poses_reduces_wiggling_below_3_mm(views: Recording) -> 
 
 
 @pytest.mark.nightly_part
-def test_command_writes_correction_that_is_applied(
-    views: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    model = camera_model("sr4000")
+def test_command_writes_correction_that_is_applied(views, tmp_path, capsys) -> None:
     folder = tmp_path / "rec"
-    writer = RecordingWriter(
-        folder, model.camera, depth_unit_m=0.0001, amplitude_kind="range_compensated"
-    )
-    for k, frame in enumerate(views.select(end=12)):
-        writer.add(replace(frame, timestamp=float(k)))
-    writer.finish()
+    seen = [replace(f, timestamp=float(k)) for k, f in enumerate(views.select(end=12))]
+    record(folder, seen, depth_unit_m=0.0001, amplitude_kind="range_compensated")
     before = open_recording(folder)[0]
     out = folder / "correction.npz"
     command = ["calibrate", "depth", str(folder), "--planes", "1", "--out", str(out)]
-    assert main(command) == 0
-    assert "planes in" in capsys.readouterr().out
+    assert "planes in" in printed(capsys, *command)
     first = read_correction(out)
     after = open_recording(folder)
     assert after.metadata["corrected"] is True
     moved = (after[0].radial_range - before.radial_range)[before.valid]
     assert 0.003 < np.abs(moved).mean() < 0.03
     # Calibrating again adds little; both corrections are composed into one.
-    assert main(command) == 2
-    assert "--overwrite" in capsys.readouterr().err
+    refuses(capsys, *command, says="--overwrite")
     assert main([*command, "--overwrite"]) == 0
     again = read_correction(out)
     r = np.linspace(1.2, 3.2, 50)
     change = np.interp(r, again.range_m, again.bias_m) - np.interp(r, first.range_m, first.bias_m)
     assert rms(change) < 0.004
-    assert main(["calibrate", "depth", str(folder), "--wall"]) == 2
-    assert "--board" in capsys.readouterr().err
+    refuses(capsys, "calibrate", "depth", folder, "--wall", says="--board")
 
 
 @pytest.mark.nightly
@@ -237,5 +227,4 @@ def test_real_sr4000_from_two_places_is_rejected(shared_data: Path) -> None:
     # The end of the corridor is nearer by 0.3 m from the second place.
     far = {view.frame // 4: r for view, r in zip(found, ranges, strict=True) if r > 4}
     assert far[0] - far[1] == pytest.approx(0.31, abs=0.04)
-    with pytest.raises(InputError, match="20 places"):
-        calibrate_depth(found, camera)
+    refused("20 places", found, camera, by=calibrate_depth)

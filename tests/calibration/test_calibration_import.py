@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from cli_calls import refuses
 from made_lens_files import OPENCV, written
 from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import BrownConrady
@@ -20,16 +21,13 @@ def test_size_that_the_file_lacks_is_that_of_the_recording(
     source = written(tmp_path, "c.json", json.dumps({"K": [[50, 0, 31], [0, 51, 23], [0, 0, 1]]}))
     out = tmp_path / "camera.json"
     command = ["calibrate", "import", str(source), "--out", str(out)]
-    assert main(command) == 2
-    assert "or pass --recording" in capsys.readouterr().err
+    refuses(capsys, *command, says="or pass --recording")
     assert main([*command, "--recording", str(room_recording)]) == 0
     images, lens = load_camera(room_recording / "camera.json")[1], load_camera(out)[1]
     assert (lens.width, lens.height, lens.fx) == (images.width, images.height, 50)
 
 
-def test_import_command(
-    tmp_path: Path, room_recording: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_import_command(tmp_path: Path, room_recording: Path, capsys) -> None:
     source = written(tmp_path, "c.json", OPENCV.format(k=[-0.2, 0.1, 1e-3, -2e-3, 0.05]))
     out = tmp_path / "lens" / "camera.json"
     command = ["calibrate", "import", str(source), "--out", str(out)]
@@ -41,8 +39,7 @@ def test_import_command(
     assert camera == BrownConrady(64, 48, 50, 51, 31, 23, -0.2, 0.1, 1e-3, -2e-3, 0.05)
     assert about.depth_unit_m == 0.0001
     assert about.amplitude_kind == "range_compensated"
-    assert main(command) == 2
-    assert "--overwrite" in capsys.readouterr().err
+    refuses(capsys, *command, says="--overwrite")
     # What the file that is replaced says of the images was lost: depth of 0.1 mm became 1 mm.
     assert main([*command, "--overwrite"]) == 0
     kept = load_camera(out)[0]

@@ -11,21 +11,22 @@ import cv2
 import numpy as np
 import pytest
 
+from cli_calls import printed, refuses
+from refused import refused
 from tofuse.apps.calibration import lens
 from tofuse.apps.calibration.board import Board, board_pose, find_corners
 from tofuse.apps.calibration.lens import BoardView, LensFit, calibrate_lens
-from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import Camera, Fisheye, Pinhole, Rational
 from tofuse.engine.errors import InputError, on_command_line
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
-from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.scenes import checkerboard
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
+from written import record
 
 BOARD = Board(checkerboard.COLUMNS, checkerboard.ROWS, checkerboard.SQUARE_M)
 TRUE = camera_model("sr4000").camera
@@ -149,8 +150,7 @@ def test_degenerate_viewpoints_are_rejected(monkeypatch: pytest.MonkeyPatch) -> 
     camera = Pinhole(320, 240, 250, 250, 160, 120)
     views = views_of(camera, poses_facing(12, 0.01))
     monkeypatch.setattr(lens, "board_views", lambda *_: (views, [], camera))
-    with pytest.raises(InputError, match="tilt it by 20 to 40 degrees"):
-        calibrate_lens(recording_of(frames()[:1]), BOARD)
+    refused("tilt it by 20 to 40 degrees", recording_of(frames()[:1]), BOARD, by=calibrate_lens)
 
 
 @pytest.mark.parametrize(
@@ -184,22 +184,15 @@ def _seen(camera: Camera, views: list[BoardView]) -> np.ndarray:
 
 
 @pytest.mark.nightly_part
-def test_command_writes_camera_for_readers(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_command_writes_camera_for_readers(tmp_path: Path, capsys) -> None:
     wrong = replace(TRUE, fx=200.0)
-    writer = RecordingWriter(
-        tmp_path / "rec", wrong, depth_unit_m=0.0001, amplitude_kind="range_compensated"
-    )
-    for k, frame in enumerate(frames()[:10]):
-        writer.add(replace(frame, camera=wrong, timestamp=float(k)))
-    writer.finish()
+    seen = [replace(f, camera=wrong, timestamp=float(k)) for k, f in enumerate(frames()[:10])]
+    record(tmp_path / "rec", seen, depth_unit_m=0.0001, amplitude_kind="range_compensated")
     out = tmp_path / "new" / "camera.json"
     command = ["calibrate", "lens", str(tmp_path / "rec"), "--board", "8x6:0.1"]
-    assert main([*command, "--out", str(out)]) == 0
-    printed = capsys.readouterr().out
-    assert "fx 2" in printed
-    assert "(sigma " in printed
+    text = printed(capsys, *command, "--out", out)
+    assert "fx 2" in text
+    assert "(sigma " in text
     about = json.loads(out.read_text())
     assert about["depth_unit_m"] == 0.0001
     assert about["amplitude_kind"] == "range_compensated"
@@ -207,7 +200,5 @@ def test_command_writes_camera_for_readers(
     assert isinstance(frame, RangeFrame)
     assert isinstance(frame.camera, Pinhole)
     assert frame.camera.fx == pytest.approx(TRUE.fx, rel=0.005)
-    assert main([*command, "--out", str(out)]) == 2
-    assert "--overwrite" in capsys.readouterr().err
-    assert main(["calibrate", "lens", str(tmp_path / "rec")]) == 2
-    assert "--board" in capsys.readouterr().err
+    refuses(capsys, *command, "--out", out, says="--overwrite")
+    refuses(capsys, "calibrate", "lens", tmp_path / "rec", says="--board")

@@ -11,21 +11,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cli_calls import printed, refuses
+from refused import refused
 from tofuse.apps.calibration.noise_estimation import estimate_noise
-from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.noise.model import NOISE, NoiseModel, noise_model_for
 from tofuse.formats.cameras.calibration_files import read_noise
-from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.models import camera_model
 from tofuse.lab.simulation.record import simulate_recording
 from tofuse.lab.simulation.render import render
 from tofuse.lab.world.scene import build
+from written import record
 
 CAMERA = Pinhole(80, 60, 60.0, 60.0, 39.5, 29.5)
 
@@ -164,29 +165,21 @@ def test_unsuitable_recordings_are_rejected(frames, message: str) -> None:
 
 
 def test_noise_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    model = camera_model("sr4000")
-    writer = RecordingWriter(
-        tmp_path / "rec", model.camera, depth_unit_m=0.0001, amplitude_kind="range_compensated"
-    )
-    for k, frame in enumerate(still_frames("corner", "sr4000", 8)[:4]):
-        writer.add(replace(frame, timestamp=k / 30))
-    writer.finish()
+    still = still_frames("corner", "sr4000", 8)[:4]
+    seen = [replace(frame, timestamp=k / 30) for k, frame in enumerate(still)]
+    record(tmp_path / "rec", seen, depth_unit_m=0.0001, amplitude_kind="range_compensated")
     out = tmp_path / "rec" / "noise.json"
-    assert main(["noise", str(tmp_path / "rec"), "--out", str(out), "--name", "mine"]) == 0
-    text = capsys.readouterr().out
+    text = printed(capsys, "noise", tmp_path / "rec", "--out", out, "--name", "mine")
     assert "raw amplitude" in text
     assert "mine, 4 frames in 1 static segment" in text
     recording = open_recording(tmp_path / "rec")
     assert recording.warnings == []
     assert noise_model_for(recording) == read_noise(out)
-    assert main(["noise", str(tmp_path / "rec"), "--out", str(out)]) == 2
-    assert "--overwrite" in capsys.readouterr().err
-    assert main(["noise", str(tmp_path / "rec"), "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
-    assert NoiseModel.from_dict(printed["model"]).amplitude == read_noise(out).amplitude
+    refuses(capsys, "noise", tmp_path / "rec", "--out", out, says="--overwrite")
+    found = json.loads(printed(capsys, "noise", tmp_path / "rec", "--json"))
+    assert NoiseModel.from_dict(found["model"]).amplitude == read_noise(out).amplitude
     out.write_text('{"schema": 1, "name": "x", "range": {"a": 20, "b": 0}}')
-    with pytest.raises(InputError, match="a must be 0 to 5"):
-        open_recording(tmp_path / "rec")
+    refused("a must be 0 to 5", tmp_path / "rec")
 
 
 @pytest.mark.parametrize("gain", [0.01, 30.0])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import shutil
 from collections.abc import Callable
@@ -15,28 +14,17 @@ import pytest
 from cli_calls import listing, refuses
 from tofuse.apps.cli.program import main
 from tofuse.formats.images.images import read_image, write_png
+from written import change_camera
 
 
 @pytest.fixture
 def recording(room_recording, tmp_path) -> Path:
     """A copy of the recording with four frames, to be broken."""
     copy = tmp_path / "rec"
-    keep = {f"{k:06d}" for k in range(4)}
-    shutil.copytree(
-        room_recording,
-        copy,
-        ignore=lambda _folder, names: [
-            n for n in names if n == "truth" or (n.endswith(".png") and n[:6] not in keep)
-        ],
-    )
+    shutil.copytree(room_recording, copy, ignore=shutil.ignore_patterns("truth", "00000[4-7].png"))
     for name in ("groundtruth.txt", "timestamps.txt", "frames.csv"):
         (copy / name).unlink()
     return copy
-
-
-def camera(recording: Path, **changes: object) -> None:
-    data = json.loads((recording / "camera.json").read_text()) | changes
-    (recording / "camera.json").write_text(json.dumps(data))
 
 
 def truncate_all(recording: Path) -> None:
@@ -72,7 +60,7 @@ BROKEN: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
     "broken json": (lambda r: (r / "camera.json").write_text('{"a": '), ("camera.json", "JSON")),
     "json bytes": (lambda r: (r / "camera.json").write_bytes(b"\xff\xfe\0"), ("camera.json",)),
     "all frames invalid": (blank_all, ("has 4 frames, none with", "0 valid points")),
-    "nan": (lambda r: camera(r, fx=float("nan")), ("camera.json", "fx", "nan")),
+    "nan": (lambda r: change_camera(r, fx=float("nan")), ("camera.json", "fx", "nan")),
     "fewer amplitudes": (lambda r: (r / "amplitude/000002.png").unlink(), ("amplitude", "3", "4")),
     "folder for camera.json": (folder_for_file, ("rec",)),
     "folders for images": (folders_for_images, ("rec",)),
@@ -101,10 +89,7 @@ def test_unreadable_files_are_rejected(recording, tmp_path, capfd, monkeypatch) 
 
     for name in ("open", "read_bytes"):
         monkeypatch.setattr(Path, name, refusing(getattr(Path, name)))
-    message = refuses(
-        capfd, "run", recording, "--out", tmp_path / "out", says=("rec", "ermission denied")
-    )
-    assert "Traceback" not in message
+    refuses(capfd, "run", recording, "--out", tmp_path / "out", says=("rec", "ermission denied"))
     assert not (tmp_path / "out").exists()
 
 
@@ -143,9 +128,8 @@ def test_unwritable_output_is_reported(code, recording, tmp_path, capfd, monkeyp
     monkeypatch.setattr(Path, "open", full)
     before = listing(tmp_path)
     out = tmp_path / "out"
-    message = refuses(
-        capfd, "run", recording, "--out", out, says=(str(tmp_path), "can't be written")
-    )
+    words = ("run", recording, "--out", out)
+    message = refuses(capfd, *words, says=(str(tmp_path), "can't be written"))
     assert os.strerror(code).lower() in message.lower()
     assert ".tofuse" not in message
     assert listing(tmp_path) == before

@@ -109,9 +109,8 @@ def test_options_override_those_of_file(tmp_path: Path) -> None:
 )
 def test_invalid_numbers_name_their_option(words: str, capfd) -> None:
     option, value = words.split(maxsplit=1)
-    refuses(
-        capfd, "run", "rec", "--out", "out", option, value, says=(option,), prefix="tofuse run: "
-    )
+    words = ("run", "rec", "--out", "out", option, value)
+    refuses(capfd, *words, says=option, prefix="tofuse run: ")
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,9 +69,8 @@ def true_motion(recording: Path, source: int, target: int) -> np.ndarray:
 @pytest.mark.nightly_part
 def test_two_frames_of_recording_are_registered(room_recording, tmp_path, capfd) -> None:
     out = tmp_path / "out"
-    status, output = register_json(
-        capfd, f"{room_recording}#3", f"{room_recording}#0", "--out", out, "--threads", 2
-    )
+    views = [f"{room_recording}#{k}" for k in (3, 0)]
+    status, output = register_json(capfd, *views, "--out", out, "--threads", 2)
     assert status == 0
     assert output["believed"] is True
     assert output["probability"] > 0.9
@@ -196,52 +196,40 @@ def test_bad_guess_is_rejected(name, clouds, tmp_path, capfd) -> None:
     if text is not None:
         guess.write_text(text)
     before = listing(tmp_path)
-    output = refuses(
-        capfd, "register", *clouds, "--guess", guess, "--out", tmp_path / "out",
-        says=(str(guess), *says),
-    )  # fmt: skip
-    assert ";" in output  # the remedy
+    words = ("register", *clouds, "--guess", guess, "--out", tmp_path / "out")
+    assert ";" in refuses(capfd, *words, says=(str(guess), *says))  # the remedy
     assert listing(tmp_path) == before
 
 
-def bad_view(name: str, folder: Path, room: Path) -> tuple[object, tuple[str, ...]]:
-    """An unusable view, and its error message."""
+def bad_cloud(folder: Path, points: np.ndarray | None = None) -> Path:
     path = folder / "bad.ply"
-    match name:
-        case "missing":
-            return folder / "none.ply", ("none.ply", "doesn't exist")
-        case "empty cloud":
-            write_ply(path, GeometryRecord(np.zeros((0, 3))))
-            return path, ("bad.ply", "0 valid points")
-        case "few points":
-            write_ply(path, GeometryRecord(np.eye(3)))
-            return path, ("bad.ply", "3 valid points", "10")
-        case "no cloud":
-            path.write_bytes(b"junk")
-            return path, ("bad.ply", "PLY")
-        case "several frames":
-            return room, (str(room), "contains 8 frames", f"{room}#0 to {room}#7")
-        case "out of range":
-            return f"{room}#8", (str(room), "has no frame 8", "0 to 7")
-        case "negative":
-            return f"{room}#-1", ("'-1'", "whole number")
-        case "no number":
-            return f"{room}#", ("''", "whole number")
-        case _:
-            raise AssertionError(name)
+    path.write_bytes(b"junk")
+    if points is not None:
+        write_ply(path, GeometryRecord(points))
+    return path
+
+
+# Unusable views of a folder and a recording, and what is said of them.
+BAD_VIEWS: dict[str, tuple[Callable[[Path, Path], object], tuple[str, ...]]] = {
+    "missing": (lambda folder, _: folder / "none.ply", ("none.ply", "doesn't exist")),
+    "empty cloud": (lambda f, _: bad_cloud(f, np.zeros((0, 3))), ("bad.ply", "0 valid points")),
+    "few points": (lambda f, _: bad_cloud(f, np.eye(3)), ("bad.ply", "3 valid points", "10")),
+    "no cloud": (lambda folder, _: bad_cloud(folder), ("bad.ply", "PLY")),
+    "several frames": (lambda _, room: room, ("contains 8 frames", "{room}#0 to {room}#7")),
+    "out of range": (lambda _, room: f"{room}#8", ("{room}", "has no frame 8", "0 to 7")),
+    "negative": (lambda _, room: f"{room}#-1", ("'-1'", "whole number")),
+    "no number": (lambda _, room: f"{room}#", ("''", "whole number")),
+}
 
 
 @pytest.mark.parametrize("role", ["source", "target"])
-@pytest.mark.parametrize(
-    "name",
-    ["missing", "empty cloud", "few points", "no cloud", "several frames", "out of range",
-     "negative", "no number"],
-)  # fmt: skip
+@pytest.mark.parametrize("name", BAD_VIEWS)
 def test_bad_view_is_rejected(name, role, clouds, room_recording, tmp_path, capfd) -> None:
-    bad, says = bad_view(name, tmp_path, room_recording)
+    make, says = BAD_VIEWS[name]
+    bad, says = make(tmp_path, room_recording), [part.format(room=room_recording) for part in says]
     before = listing(tmp_path)
     words = (bad, clouds[1]) if role == "source" else (clouds[0], bad)
-    assert ";" in refuses(capfd, "register", *words, "--out", tmp_path / "out", says=says)
+    assert ";" in refuses(capfd, "register", *words, "--out", tmp_path / "out", says=tuple(says))
     assert listing(tmp_path) == before
 
 
@@ -255,9 +243,8 @@ def test_overwrite_replaces_only_earlier_result(clouds, tmp_path, capfd, light_p
     first = (out / "registration.json").read_text()
     (out / "notes.txt").write_text("mine")
     (out / "aligned.ply").unlink()
-    refuses(
-        capfd, "register", *clouds, "--out", out, says=("contains an earlier result", "--overwrite")
-    )
+    says = ("contains an earlier result", "--overwrite")
+    refuses(capfd, "register", *clouds, "--out", out, says=says)
     again = ("register", clouds[1], clouds[1], "--out", out, "--overwrite")
     refuses(capfd, *again, says=("notes.txt", "is not a file of an earlier result"))
     assert (out / "notes.txt").read_text() == "mine"

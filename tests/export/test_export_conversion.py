@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,10 @@ import pytest
 
 import made_arrays
 from camera_files import MAKERS
+from cli_calls import printed, refuses
 from damaged_files import make_native, make_ply
 from made_recordings import make_sr4000
-from tofuse.apps.cli.program import main
+from refused import refused
 from tofuse.engine.cameras.cameras import RayTable
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
@@ -27,6 +27,7 @@ from tofuse.formats.readers.native import NativeSource
 from tofuse.formats.recordings import RecordingWriter
 from tofuse.formats.recordings.open import open_recording
 from tofuse.formats.rigs.rig_file import Rig, RigCamera, write_rig
+from written import change_camera
 
 CHANNELS = ("amplitude_image", "confidence_image", "color_image")
 
@@ -82,11 +83,10 @@ def test_depth_stored_as_floats(tmp_path: Path) -> None:
     """A unit of 1 m, as of float arrays, is no count to which depth is rounded."""
     folder = tmp_path / "native"
     make_native(folder)
-    about = json.loads((folder / "camera.json").read_text()) | {"depth_unit_m": 1.0}
-    (folder / "camera.json").write_text(json.dumps(about))
+    change_camera(folder, depth_unit_m=1.0)
     for k, path in enumerate(sorted((folder / "depth").iterdir())):
-        depth = np.linspace(1, 2 + k, about["height"] * about["width"], dtype=np.float32)
-        np.save(path.with_suffix(".npy"), depth.reshape(about["height"], about["width"]))
+        depth = np.linspace(1, 2 + k, 30 * 40, dtype=np.float32)
+        np.save(path.with_suffix(".npy"), depth.reshape(30, 40))
         path.unlink()
     before = open_recording(folder)
     check_same(before, open_recording(convert(before, tmp_path / "out").folder), depth=6e-5)
@@ -101,8 +101,7 @@ def test_rays_of_each_frame(tmp_path: Path) -> None:
     assert isinstance(after[1].camera, RayTable)
     assert not np.array_equal(after[0].camera.rays(), after[1].camera.rays())
     (tmp_path / "out" / "rays" / "000001.npy").unlink()
-    with pytest.raises(InputError, match="rays: has 2 images"):
-        open_recording(tmp_path / "out")
+    refused("rays: has 2 images", tmp_path / "out")
 
 
 def test_correction_is_kept_with_raw_measurements(tmp_path: Path) -> None:
@@ -154,15 +153,11 @@ def test_convert_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     path = tmp_path / "scan" / "depth_0001.png"
     path.write_bytes(path.read_bytes()[:60])
     words = ["convert", str(tmp_path / "scan"), "--out", str(tmp_path / "out")]
-    assert main(words) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = printed(capsys, *words).splitlines()
     assert lines[0] == f"2 frames in {tmp_path / 'out'}"
     assert any("depth_0001.png" in line for line in lines[1:])
-    assert main(words) == 2
-    error = capsys.readouterr().err
-    assert error == f"tofuse: {tmp_path / 'out'}: isn't empty; choose a new folder\n"
-    assert main([*words[:-1], str(tmp_path / "new"), "--start", "7"]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    refuses(capsys, *words, says=f"{tmp_path / 'out'}: isn't empty; choose a new folder")
+    refuses(capsys, *words[:-1], tmp_path / "new", "--start", "7", says="--start")
     assert not (tmp_path / "new").exists()
 
 
@@ -190,8 +185,7 @@ def test_failed_conversion_leaves_nothing(tmp_path: Path, monkeypatch) -> None:
             convert(recording, tmp_path / "out")
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
     (tmp_path / "file").write_text("x")
-    with pytest.raises(OutputError, match="is a file"):
-        convert(recording, tmp_path / "file")
+    refused("is a file", recording, tmp_path / "file", by=convert, error=OutputError)
     shutil.rmtree(tmp_path / "out", ignore_errors=True)
     (tmp_path / "out").mkdir()
     assert convert(recording, tmp_path / "out").frames == 3
@@ -212,9 +206,7 @@ REAL: list[tuple[str, int, dict[str, Any]]] = [
 
 @pytest.mark.nightly
 @pytest.mark.parametrize(("name", "every", "how"), REAL)
-def test_real_recordings(
-    shared_data: Path, tmp_path: Path, name: str, every: int, how: dict[str, Any]
-) -> None:
+def test_real_recordings(shared_data, tmp_path, name, every, how) -> None:
     before = open_recording(shared_data / name).select(every=every)
     convert(before, tmp_path / "out")
     check_same(before, open_recording(tmp_path / "out"), **how)

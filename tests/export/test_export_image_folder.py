@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from cli_calls import refuses
 from posed_results import BROWN, DISTANCE, NORMAL, POSED, POSES, SIZE, made_result, plane
-from tofuse.apps.cli.program import main
+from refused import refused
 from tofuse.apps.export.exporting import export
 from tofuse.apps.results.run_json import read_run_json
 from tofuse.engine.cameras.cameras import BrownConrady, Camera, Fisheye, Pinhole, Rational, RayTable
@@ -106,15 +106,11 @@ def test_colmap_text_files(tmp_path: Path) -> None:
     assert lines[2] == ""
     found = read_poses(folder / "sparse" / "0" / "images.txt")
     np.testing.assert_allclose(found.poses, POSES[[0, 3]], atol=1e-9)
-    assert sorted(p.name for p in (folder / "images").iterdir()) == [
-        "frame_000000.png",
-        "frame_000003.png",
-    ]
+    names = ["frame_000000.png", "frame_000003.png"]
+    assert sorted(p.name for p in (folder / "images").iterdir()) == names
 
 
-def test_colour_keeps_its_recorded_resolution(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_colour_keeps_its_recorded_resolution(tmp_path: Path, monkeypatch) -> None:
     full = np.random.default_rng(6).integers(1, 255, (72, 96, 3)).astype(np.uint8)
     monkeypatch.setattr(NativeSource, "full_resolution_color", lambda _self, _index: full)
     (folder,) = export(made_result(tmp_path, PLAIN), ["nerfstudio"])
@@ -134,61 +130,41 @@ def test_corrected_camera_is_written(tmp_path: Path) -> None:
     assert z[18, 23] == pytest.approx(1000 * plane(PLAIN, 0)[18, 23] + 100, abs=1)
 
 
-def _gone(result: Path) -> None:
-    shutil.rmtree(result.parent / "scan")
+def _nearer(result: Path) -> list[dict[str, object]]:
+    frames = read_run_json(result / "run.json")["frames"]
+    return [frame | {"mean_depth_m": 0.123} for frame in frames]
 
 
 def _longer(result: Path) -> None:
     frames = read_run_json(result / "run.json")["frames"]
-    for frame in frames:
-        frame["timestamp"] += 1.0
     times, poses = read_tum(result / "trajectory.txt")
     write_tum(result / "trajectory.txt", times + 1.0, poses)
-    change_run(result, frames=frames)
-
-
-def _other_image(result: Path) -> None:
-    frames = read_run_json(result / "run.json")["frames"]
-    change_run(result, frames=[frame | {"mean_depth_m": 0.123} for frame in frames])
-
-
-def _damaged(result: Path) -> None:
-    change_run(result, input=None)
-
-
-def _with_invalid_corrections(result: Path) -> None:
-    change_run(result, config={"corrections": [3]})
+    change_run(result, frames=[frame | {"timestamp": frame["timestamp"] + 1.0} for frame in frames])
 
 
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (_gone, "which doesn't exist"),
+        (lambda result: shutil.rmtree(result.parent / "scan"), "which doesn't exist"),
         (_longer, "does not match the frames"),
-        (_other_image, "at frame 0, which has changed"),
-        (_damaged, "is damaged"),
-        (_with_invalid_corrections, "is damaged"),
+        (lambda result: change_run(result, frames=_nearer(result)), "frame 0, which has changed"),
+        (lambda result: change_run(result, input=None), "is damaged"),
+        (lambda result: change_run(result, config={"corrections": [3]}), "is damaged"),
     ],
+    ids=["gone", "longer", "other image", "no input", "invalid corrections"],
 )
-def test_impossible_exports_are_refused(
-    tmp_path: Path, spoil: Callable[[Path], None], says: str, capsys
-) -> None:
+def test_impossible_exports_are_refused(tmp_path, spoil, says, capsys) -> None:
     result = made_result(tmp_path, PLAIN)
     spoil(result)
     for name in ("nerfstudio", "colmap"):
-        assert main(["export", str(result), name]) == 2
-        error = capsys.readouterr().err
-        assert says in error
-        assert len(error.strip().splitlines()) == 1
-        assert not (result / name).exists()
+        refuses(capsys, "export", result, name, says=says)
     assert sorted(p.name for p in result.iterdir()) == ["cloud.ply", "run.json", "trajectory.txt"]
 
 
 def test_only_own_folders_are_replaced(tmp_path: Path) -> None:
     result = made_result(tmp_path, PLAIN)
     (folder,) = export(result, ["colmap"])
-    with pytest.raises(OutputError, match="pass overwrite"):
-        export(result, ["colmap"])
+    refused("pass overwrite", result, ["colmap"], by=export, error=OutputError)
     (folder / "images" / "frame_000001.png").unlink()
     export(result, ["colmap"], overwrite=True)
     assert (folder / "images" / "frame_000001.png").is_file()

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import tofuse
+from refused import refused
 from tofuse.apps.cli.program import main
 from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole, RayTable
 from tofuse.engine.cameras.depth_conversion import points_from_z
-from tofuse.engine.errors import InputError, OutputError
+from tofuse.engine.errors import OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.formats.cameras.rectify import Rectifier, pinhole_of
@@ -68,14 +69,11 @@ def test_wide_lens_is_cropped_at_sixty_degrees() -> None:
 
 def turned(frames: int = 4) -> Recording:
     rng = np.random.default_rng(6)
-    made, poses = [], []
+    made, reference = [], np.tile(np.eye(4), (frames, 1, 1))
     for k in range(frames):
         amplitude = rng.uniform(10, 900, (72, 96)).astype(np.float32)
         made.append(RangeFrame(k, 100.0 + k / 10, BARREL, plane_depth(BARREL), "z", amplitude))
-        T = np.eye(4)
-        T[0, 3] = 0.1 * k
-        poses.append(T)
-    reference = np.array(poses)
+        reference[k, 0, 3] = 0.1 * k
     reference[2] = np.nan
     return Recording.of(ArraySource(made, reference), "made", "made")
 
@@ -113,13 +111,11 @@ def test_open3d_is_read_back(tmp_path: Path) -> None:
 
 def test_unsupported_conversions_are_refused(tmp_path: Path) -> None:
     cloud = Recording.of(ArraySource([CloudFrame.of(np.ones((5, 3)))]), "made", "made")
-    with pytest.raises(InputError, match="contains clouds"):
-        convert_to(cloud, tmp_path / "a", "tum")
+    refused("contains clouds", cloud, tmp_path / "a", "tum", by=convert_to)
     assert not list(tmp_path.iterdir())
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "mine").write_text("x")
-    with pytest.raises(OutputError, match="isn't empty"):
-        convert_to(turned(), tmp_path / "a", "tum")
+    refused("isn't empty", turned(), tmp_path / "a", "tum", by=convert_to, error=OutputError)
 
 
 def test_far_pixels_are_left_out_and_counted(tmp_path: Path) -> None:

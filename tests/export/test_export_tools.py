@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
+from cli_calls import printed, refuses
 from posed_results import DISTANCE, NORMAL, POSED, POSES, made_result, plane
-from tofuse.apps.cli.program import main
 from tofuse.apps.export import exporting
 from tofuse.apps.export.exporting import export
 from tofuse.apps.export.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -153,16 +153,15 @@ def test_mcap_read_by_its_reader(result: Path) -> None:
             assert set(data) == set(json.loads(schema.data)["properties"])
             assert message.log_time == data["timestamp"]["sec"] * 10**9 + data["timestamp"]["nsec"]
             messages.setdefault(channel.topic, []).append((schema.name, data))
-    assert {topic: {name for name, _ in found} for topic, found in messages.items()} == {
-        "/tf": {"foxglove.FrameTransform"},
-        "/pose": {"foxglove.PoseInFrame"},
-        "/trajectory": {"foxglove.PosesInFrame"},
-        "/cloud": {"foxglove.PointCloud"},
-        "/depth/calibration": {"foxglove.CameraCalibration"},
-        "/depth/image": {"foxglove.RawImage"},
-        "/color/calibration": {"foxglove.CameraCalibration"},
-        "/color/image": {"foxglove.CompressedImage"},
+    kinds = {
+        (topic, name.removeprefix("foxglove.")) for topic in messages for name, _ in messages[topic]
     }
+    assert kinds == {
+        ("/tf", "FrameTransform"), ("/pose", "PoseInFrame"), ("/trajectory", "PosesInFrame"),
+        ("/cloud", "PointCloud"), ("/depth/calibration", "CameraCalibration"),
+        ("/depth/image", "RawImage"), ("/color/calibration", "CameraCalibration"),
+        ("/color/image", "CompressedImage"),
+    }  # fmt: skip
     poses = [data for _, data in messages["/pose"]]
     assert len(poses) == len(POSED)
     for k, data in zip(POSED, poses, strict=True):
@@ -177,14 +176,9 @@ def test_mcap_read_by_its_reader(result: Path) -> None:
         np.testing.assert_allclose(T, POSES[k], atol=1e-6)
     [(_, cloud)] = messages["/cloud"]
     kinds = {1: "u1", 7: "<f4"}
-    columns = np.dtype(
-        {
-            "names": [field["name"] for field in cloud["fields"]],
-            "formats": [kinds[field["type"]] for field in cloud["fields"]],
-            "offsets": [field["offset"] for field in cloud["fields"]],
-            "itemsize": cloud["point_stride"],
-        }
-    )
+    described = [(f["name"], kinds[f["type"]], f["offset"]) for f in cloud["fields"]]
+    layout = dict(zip(("names", "formats", "offsets"), zip(*described, strict=True), strict=True))
+    columns = np.dtype(layout | {"itemsize": cloud["point_stride"]})
     points, expected = np.frombuffer(base64.b64decode(cloud["data"]), columns), cloud_of(result)
     np.testing.assert_array_equal(np.stack([points[a] for a in "xyz"], 1), expected.points)
     np.testing.assert_array_equal(points["sigma"], expected.scalars["sigma"])
@@ -243,12 +237,9 @@ def test_rerun_read_by_its_reader(result: Path) -> None:
     assert faces == [[0, 1, 48], [1, 49, 48]]
     (path_drawn,) = columns["/world/trajectory", "LineStrips3D:strips"]
     np.testing.assert_allclose(path_drawn[0], POSES[POSED, :3, 3], atol=1e-6)
-    depth = [
-        np.frombuffer(bytes(row[0]), np.float32)
-        for row in columns["/world/camera/depth", "DepthImage:buffer"]
-    ]
-    for k, image in zip(POSED, depth, strict=True):
-        np.testing.assert_allclose(image.reshape(36, 48), plane(CAMERA, k), atol=1e-6)
+    for k, row in zip(POSED, columns["/world/camera/depth", "DepthImage:buffer"], strict=True):
+        image = np.frombuffer(bytes(row[0]), np.float32).reshape(36, 48)
+        np.testing.assert_allclose(image, plane(CAMERA, k), atol=1e-6)
     K = column("/camera/depth", "Pinhole:image_from_camera").reshape(-1, 3, 3)[0].T
     # In Rerun the centre of the first pixel is at (0.5, 0.5).
     np.testing.assert_allclose(K, [[40, 0, 23.5], [0, 41, 18.5], [0, 0, 1]])
@@ -269,19 +260,15 @@ def test_missing_package_is_named_before_any_work(
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.setattr(exporting, "_Result", None)
-    assert main(["export", str(result), "pcd", name]) == 2
-    assert f"export {name}: needs the package {package}; pip install {extra}" in (
-        capsys.readouterr().err
-    )
+    says = f"export {name}: needs the package {package}; pip install {extra}"
+    refuses(capsys, "export", result, "pcd", name, says=says)
 
 
-def test_command_writes_grids_that_belong_to_the_result(
-    result: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["export", str(result), *FORMATS, "--voxel", "0.1m", "--every", "2"]) == 0
+def test_command_writes_grids_that_belong_to_the_result(result: Path, capsys) -> None:
+    words = ("export", result, *FORMATS, "--voxel", "0.1m", "--every", "2")
     names = ["occupancy.npz", "esdf.npz", "octomap.bt"]
-    assert [Path(line).name for line in capsys.readouterr().out.split()] == names
+    assert [Path(line).name for line in printed(capsys, *words).split()] == names
     with OutputFolder(result, overwrite=True):
         pass
-    assert main(["export", str(result), "esdf", "--voxel", "1mm", "--overwrite"]) == 2
-    assert capsys.readouterr().err.startswith("tofuse: --voxel: of 0.001 m makes")
+    words = ("export", result, "esdf", "--voxel", "1mm", "--overwrite")
+    refuses(capsys, *words, says="--voxel: of 0.001 m makes")

@@ -10,7 +10,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from cli_calls import printed, refuses
 from parsed_glb import parse
+from refused import refused
 from tofuse.apps.cli.options import Export
 from tofuse.apps.cli.program import main
 from tofuse.apps.export.exporting import FORMATS, export
@@ -59,15 +61,9 @@ def result(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def expected(result: Path) -> SimpleNamespace:
-    ply = read_ply(result / "cloud.ply")
-    return SimpleNamespace(
-        points=ply.points,
-        normals=ply.normals,
-        color=ply.color,
-        views=ply.scalars["views"],
-        sigma=ply.scalars["sigma"],
-        faces=read_ply(result / "mesh.ply").faces,
-    )
+    ply, faces = read_ply(result / "cloud.ply"), read_ply(result / "mesh.ply").faces
+    columns = {name: getattr(ply, name) for name in ("points", "normals", "color")}
+    return SimpleNamespace(**columns, **ply.scalars, faces=faces)
 
 
 def test_ply_read_by_trimesh(result: Path, expected) -> None:
@@ -86,11 +82,9 @@ def test_pcd(result: Path, expected) -> None:
     pypcd4 = pytest.importorskip("pypcd4")
     (path,) = export(result, ["pcd"])
     cloud = pypcd4.PointCloud.from_path(path)
-    xyz = cloud.numpy(("x", "y", "z", "normal_x", "normal_y", "normal_z", "sigma", "views"))
-    np.testing.assert_array_equal(xyz[:, :3], expected.points)
-    np.testing.assert_array_equal(xyz[:, 3:6], expected.normals)
-    np.testing.assert_array_equal(xyz[:, 6], expected.sigma)
-    np.testing.assert_array_equal(xyz[:, 7], expected.views)
+    found = cloud.numpy(("x", "y", "z", "normal_x", "normal_y", "normal_z", "sigma", "views"))
+    columns = [expected.points, expected.normals, expected.sigma, expected.views]
+    np.testing.assert_array_equal(found, np.column_stack(columns))
     rgb = pypcd4.PointCloud.decode_rgb(cloud.pc_data["rgb"])
     np.testing.assert_array_equal(rgb, expected.color)
 
@@ -202,13 +196,11 @@ def test_large_meshes_have_vertex_colours(result: Path, upright, monkeypatch) ->
 
 @pytest.mark.parametrize("name", ["glb", "stl"])
 def test_a_surface_without_triangles_is_refused(name: str, result: Path) -> None:
-    with pytest.raises(InputError, match="faces: 1 are too few"):
-        export(result, [name], faces=1)
+    refused("faces: 1 are too few", result, [name], by=export, faces=1)
     mesh = read_ply(result / "mesh.ply")
     write_ply(result / "mesh.ply", replace(mesh, faces=np.zeros((0, 3), np.int32)))
     change_run(result)
-    with pytest.raises(InputError, match=r"mesh\.ply: has no triangles"):
-        export(result, [name])
+    refused(r"mesh\.ply: has no triangles", result, [name], by=export)
 
 
 @pytest.mark.parametrize(
@@ -258,29 +250,23 @@ def test_kitti(result: Path) -> None:
 def test_export_command(result: Path, tmp_path: Path, capsys) -> None:
     assert ", ".join(FORMATS) in " ".join((Export.__doc__ or "").split())
     out = tmp_path / "new" / "files"
-    assert main(["export", str(result), "las", "kitti", "--out", str(out)]) == 0
-    assert capsys.readouterr().out.split() == [
-        str(out / "cloud.las"),
-        str(out / "trajectory.kitti.txt"),
-    ]
+    names = [str(out / name) for name in ("cloud.las", "trajectory.kitti.txt")]
+    assert printed(capsys, "export", result, "las", "kitti", "--out", out).split() == names
     before = (out / "cloud.las").read_bytes()
     (out / "cloud.las").write_bytes(b"mine")
-    assert main(["export", str(result), "las", "--out", str(out)]) == 2
-    assert "--overwrite" in capsys.readouterr().err
+    refuses(capsys, "export", result, "las", "--out", out, says="--overwrite")
     assert main(["export", str(result), "las", "--out", str(out), "--overwrite"]) == 0
     assert (out / "cloud.las").read_bytes() == before
     (result / "mesh.ply").unlink()
     (out / "mine.txt").write_text("mine")
     kept = sorted(out.iterdir())
     for folder in (tmp_path / "fresh", out):  # the cloud comes first
-        assert main(["export", str(result), "pcd", "log", "stl", "--out", str(folder)]) == 2
-        assert "mesh.ply: doesn't exist" in capsys.readouterr().err
+        words = ("export", result, "pcd", "log", "stl", "--out", folder)
+        refuses(capsys, *words, says="mesh.ply: doesn't exist")
     assert not (tmp_path / "fresh").exists()
     assert sorted(out.iterdir()) == kept
-    assert main(["export", str(tmp_path), "las"]) == 2
-    assert "is not a result" in capsys.readouterr().err
-    assert main(["export", str(result), "doc"]) == 2
-    assert "use one of" in capsys.readouterr().err
+    refuses(capsys, "export", tmp_path, "las", says="is not a result")
+    refuses(capsys, "export", result, "doc", says="use one of")
 
 
 def test_only_one_process_writes_to_a_result(result: Path, tmp_path: Path) -> None:

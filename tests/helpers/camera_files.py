@@ -120,14 +120,6 @@ def read_frames(path: Path, format_: str | None, camera: Path | None = None) -> 
     return read
 
 
-def read_through(
-    path: Path, format_: str | None, camera: Path | None = None
-) -> tuple[int, int, int]:
-    """Read every frame; return the numbers of readable and unreadable ones, and of rejections."""
-    read = read_frames(path, format_, camera)
-    return len(read.frames), read.unread, int(read.refused)
-
-
 EVERY = MAKERS | OTHERS
 
 

@@ -27,6 +27,11 @@ def infrared_counts(k: int) -> UInt16:
     return (40 + k + np.arange(HEIGHT)[:, None] + np.zeros(WIDTH)).astype(np.uint16)
 
 
+def named(*names: str) -> SimpleNamespace:
+    """Constants that are their own names."""
+    return SimpleNamespace(**{name: name for name in names})
+
+
 class FakeRealSense(ModuleType):
     """pyrealsense2: milliseconds, metres per count, images that are false where they are missing.
 
@@ -34,27 +39,18 @@ class FakeRealSense(ModuleType):
     and frame 3 the infrared image.
     """
 
-    stream = SimpleNamespace(depth="depth", infrared="infrared")
-    format = SimpleNamespace(z16="z16", y8="y8")
-    distortion = SimpleNamespace(
-        none="none",
-        brown_conrady="brown_conrady",
-        inverse_brown_conrady="inverse_brown_conrady",
-        ftheta="ftheta",
-    )
-    camera_info = SimpleNamespace(
-        name="name", product_line="product_line", serial_number="serial_number"
-    )
+    stream, format = named("depth", "infrared"), named("z16", "y8")
+    distortion = named("none", "brown_conrady", "inverse_brown_conrady", "ftheta")
+    camera_info = named("name", "product_line", "serial_number")
 
-    option = SimpleNamespace(global_time_enabled="global_time_enabled")
+    option = named("global_time_enabled")
     timestamp_domain = SimpleNamespace(hardware_clock="hardware", global_time="global")
 
     def __init__(self, line: str = "L500", model: str = "none", frames: int = 7) -> None:
         super().__init__("pyrealsense2")
         self.sent, self.global_time, self.settled_after = 0, 1.0, 1
         self.line, self.model, self.left = line, model, frames
-        self.plugged_in = True
-        self.stopped = 0
+        self.plugged_in, self.stopped = True, 0
         self.enabled: list[str] = []
         coeffs = [0.1, -0.05, 0.001, -0.002, 0.01] if model != "none" else [0.0] * 5
         self.lens = SimpleNamespace(
@@ -187,12 +183,9 @@ class FakeOrbbec(ModuleType):
         self.distortion = SimpleNamespace(**dict(zip(names, values, strict=True)))
         lens = SimpleNamespace(width=WIDTH, height=HEIGHT, fx=30.0, fy=30.5, cx=15.5, cy=12.0)
         self.profile = SimpleNamespace(
-            get_width=lambda: WIDTH,
-            get_height=lambda: HEIGHT,
-            get_fps=lambda: 30,
-            get_intrinsic=lambda: lens,
-            get_distortion=lambda: self.distortion,
-        )
+            get_width=lambda: WIDTH, get_height=lambda: HEIGHT, get_fps=lambda: 30,
+            get_intrinsic=lambda: lens, get_distortion=lambda: self.distortion,
+        )  # fmt: skip
 
     def Config(self) -> Any:
         return SimpleNamespace(enable_stream=lambda profile: None)
@@ -243,12 +236,9 @@ def fake_ifm3d(frames: int = 5, *, converted: bool = True) -> dict[str, ModuleTy
 
     left = [frames]
     ids = SimpleNamespace(
-        RADIAL_DISTANCE_IMAGE=100,
-        NORM_AMPLITUDE_IMAGE=101,
-        RADIAL_DISTANCE_NOISE=105,
-        CONFIDENCE_IMAGE=300,
-        TOF_INFO=420,
-    )
+        RADIAL_DISTANCE_IMAGE=100, NORM_AMPLITUDE_IMAGE=101, RADIAL_DISTANCE_NOISE=105,
+        CONFIDENCE_IMAGE=300, TOF_INFO=420,
+    )  # fmt: skip
 
     def O3R(address: str) -> Any:
         if address == "0.0.0.0":

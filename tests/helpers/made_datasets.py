@@ -11,6 +11,7 @@ from ray_casting import rays_at, to_walls
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.geometry.se3 import exp
 from tofuse.formats.images.images import write_png
+from written import camera_json
 
 CAMERA = Pinhole(64, 48, 60.0, 62.0, 31.0, 24.5)
 SIDES = np.array([2.0, 1.5, 2.5])  # half of the edges of the box, m
@@ -86,6 +87,4 @@ def make_pairs(
     for k, z in enumerate(depths()):
         counts = np.rint(10_000 * z).astype(np.uint16)
         write_images(folder / depth.format(k), folder / image.format(k), counts, k)
-    about = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    about |= {"schema": 1, "model": "pinhole", "depth_unit_m": 1e-4, "depth_kind": "z"}
-    (folder / "camera.json").write_text(json.dumps(about))
+    camera_json(folder / "camera.json", CAMERA, depth_unit_m=1e-4)

@@ -11,7 +11,9 @@ import numpy as np
 
 import made_phones
 from made_phones import ARKIT, CONFIDENCE, CX, CY, DEPTH, FX, HEIGHT, POSES, WIDTH, millimetres
+from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.formats.images.images import write_png
+from written import camera_json
 
 IMAGE = (8 * WIDTH, 8 * HEIGHT)  # of colour
 TICKS = [132_000_000_000_000_000 + 2_000_000 * k for k in range(3)]  # 0.2 s apart
@@ -51,28 +53,11 @@ def make_nerfstudio(folder: Path) -> None:
         write_png(folder / "depth" / f"frame_{k}.png", millimetres(DEPTH[k]))
         image = made_phones.jpeg(made_phones.color_image(k, *IMAGE))
         (folder / "images" / f"frame_{k}.jpg").write_bytes(image)
-        frames.append(
-            {
-                "file_path": f"images/frame_{k}.jpg",
-                "depth_file_path": f"depth/frame_{k}.png",
-                "transform_matrix": (POSES[k] @ ARKIT).tolist(),
-            }
-        )
-    about = {
-        "camera_model": "OPENCV",
-        "w": IMAGE[0],
-        "h": IMAGE[1],
-        "fl_x": 200.0,
-        "fl_y": 201.0,
-        "cx": 130.0,
-        "cy": 95.0,
-        "k1": -0.05,
-        "k2": 0.01,
-        "p1": 0.001,
-        "p2": 0.0,
-        "frames": frames,
-    }
-    (folder / "transforms.json").write_text(json.dumps(about))
+        names = {"file_path": f"images/frame_{k}.jpg", "depth_file_path": f"depth/frame_{k}.png"}
+        frames.append(names | {"transform_matrix": (POSES[k] @ ARKIT).tolist()})
+    about = {"camera_model": "OPENCV", "w": IMAGE[0], "h": IMAGE[1], "fl_x": 200.0, "fl_y": 201.0}
+    about |= {"cx": 130.0, "cy": 95.0, "k1": -0.05, "k2": 0.01, "p1": 0.001, "p2": 0.0}
+    (folder / "transforms.json").write_text(json.dumps(about | {"frames": frames}))
 
 
 def make_nerfcapture(folder: Path) -> None:
@@ -84,20 +69,10 @@ def make_nerfcapture(folder: Path) -> None:
         counts = np.round(DEPTH[k] / unit).astype(np.uint16)
         write_png(folder / "images" / f"{k}.depth.png", counts)
         write_png(folder / "images" / f"{k}.png", made_phones.color_image(k, WIDTH, HEIGHT))
-        frames.append(
-            {
-                "file_path": f"images/{k}",
-                "depth_path": f"images/{k}.depth.png",
-                "transform_matrix": (POSES[k] @ ARKIT).tolist(),
-                "timestamp": 7.0 + 0.1 * k,
-                "fl_x": 30.0 + k,
-                "fl_y": 30.0 + k,
-                "cx": 16.5,
-                "cy": 12.5,
-                "w": WIDTH,
-                "h": HEIGHT,
-            }
-        )
+        frame = {"file_path": f"images/{k}", "depth_path": f"images/{k}.depth.png"}
+        frame |= {"transform_matrix": (POSES[k] @ ARKIT).tolist(), "timestamp": 7.0 + 0.1 * k}
+        frame |= {"fl_x": 30.0 + k, "fl_y": 30.0 + k, "cx": 16.5, "cy": 12.5}
+        frames.append(frame | {"w": WIDTH, "h": HEIGHT})
     about = {"fl_x": 1.0, "fl_y": 1.0, "cx": 320.0, "cy": 240.0, "w": WIDTH, "h": HEIGHT}
     about |= {"integer_depth_scale": unit, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(about))
@@ -183,7 +158,5 @@ def make_depth16(folder: Path) -> None:
         (folder / f"{12 * k:08d}_depth16.bin").write_bytes(samples.astype("<u2").tobytes())
     image = made_phones.jpeg(made_phones.color_image(1, *IMAGE))
     (folder / "00000012_image.jpg").write_bytes(image)
-    about = {"schema": 1, "model": "pinhole", "width": WIDTH, "height": HEIGHT}
-    about |= {"fx": 30.0, "fy": 30.5, "cx": 15.5, "cy": 11.5}
-    about |= {"depth_unit_m": 0.001, "depth_kind": "z", "frame_rate_hz": 10}
-    (folder / "camera.json").write_text(json.dumps(about))
+    lens = Pinhole(WIDTH, HEIGHT, 30.0, 30.5, 15.5, 11.5)
+    camera_json(folder / "camera.json", lens, frame_rate_hz=10)

@@ -23,20 +23,9 @@ FISHEYE = (10.5, 10.4, 12.0, 9.0, 0.0, 0.05, -0.01, 0.002, -0.0003, 1.4)
 def chunk(kind: int, content: bytes, size: tuple[int, int], format_: int, k: int) -> bytes:
     about = json.dumps({"Version": "0.0.1"}).encode() + b"\0"
     head = 48 + len(about)
-    words = (
-        kind,
-        head + len(content),
-        head,
-        3,
-        *size,
-        format_,
-        100 * k,
-        k,
-        0,
-        1000,
-        50_000_000 * k,
-    )
-    return struct.pack("<12I", *words) + about + content
+    times = (100 * k, k, 0, 1000, 50_000_000 * k)
+    words = struct.pack("<12I", kind, head + len(content), head, 3, *size, format_, *times)
+    return words + about + content
 
 
 def head_info(unit: float = UNIT, model: int = 0, numbers: tuple[float, ...] = BOUGUET) -> bytes:
@@ -62,21 +51,11 @@ def make_h5(path: Path, *, model: int = 0, heads: int = 1) -> None:
 
     path.parent.mkdir(parents=True, exist_ok=True)
     size = (HEIGHT, WIDTH)
-    dtype = np.dtype(
-        [
-            ("_data_timestamp", "<u8"),
-            ("width", "<u2"),
-            ("height", "<u2"),
-            ("distance", "<u2", size),
-            ("distanceNoise", "<u2", size),
-            ("distanceResolution", "<f4"),
-            ("amplitude", "<u2", size),
-            ("timestamp_ns", "<u8", (3,)),
-            ("confidence", "<u2", size),
-            ("intrinsicCalibModelID", "<u4"),
-            ("intrinsicCalibModelParameters", "<f4", (32,)),
-        ]
-    )
+    images = ("distance", "distanceNoise", "amplitude", "confidence")
+    dtype = [("_data_timestamp", "<u8"), *((name, "<u2", size) for name in images)]
+    dtype += [("width", "<u2"), ("height", "<u2"), ("distanceResolution", "<f4")]
+    dtype += [("timestamp_ns", "<u8", (3,)), ("intrinsicCalibModelID", "<u4")]
+    dtype += [("intrinsicCalibModelParameters", "<f4", (32,))]
     rows = np.zeros(3, dtype)
     rows["distance"], rows["distanceNoise"], rows["amplitude"] = COUNTS, NOISE, AMPLITUDE
     rows["confidence"], rows["distanceResolution"] = FLAGS, UNIT

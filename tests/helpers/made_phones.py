@@ -44,6 +44,10 @@ def jpeg(image: np.ndarray) -> bytes:
     return bytes(data)
 
 
+def projection(focal_length: float) -> np.ndarray:
+    return np.diag([2 * focal_length / 1920, 2 * focal_length / 1440, -1, 0])
+
+
 def make_scanner_app(folder: Path) -> None:
     folder.mkdir(parents=True)
     for k in range(3):
@@ -53,9 +57,7 @@ def make_scanner_app(folder: Path) -> None:
             "time": 1000.5 + 0.2 * k,
             "intrinsics": [FX + k, 0, CX, 0, FX + k, CY, 0, 0, 1],
             "cameraPoseARFrame": (POSES[k] @ ARKIT).ravel().tolist(),
-            "projectionMatrix": np.diag([2 * (FX + k) / 1920, 2 * (FX + k) / 1440, -1, 0])
-            .ravel()
-            .tolist(),
+            "projectionMatrix": projection(FX + k).ravel().tolist(),
         }
         (folder / f"frame_{k:05d}.json").write_text(json.dumps(facts))
     (folder / "frame_00001.jpg").write_bytes(jpeg(color_image(1)))
@@ -143,19 +145,10 @@ def exr_bytes(
 def record3d_metadata() -> dict[str, object]:
     """Portrait: the images are rotated, 1440 x 1920 and 24 x 32."""
     poses = POSES @ ARKIT
-    return {
-        "w": 1440,
-        "h": 1920,
-        "dw": HEIGHT,
-        "dh": WIDTH,
-        "fps": 60,
-        "K": [FX, 0, 0, 0, FX, 0, CY, CX, 1],
-        "frameTimestamps": [k / 60 for k in range(5)],
-        "poses": [
-            [*from_matrix(poses[k % 3, :3, :3]).tolist(), *poses[k % 3, :3, 3].tolist()]
-            for k in range(5)
-        ],
-    }
+    rows = np.concatenate([from_matrix(poses[:, :3, :3]), poses[:, :3, 3]], 1).tolist()
+    about = {"w": 1440, "h": 1920, "dw": HEIGHT, "dh": WIDTH, "fps": 60}
+    about |= {"K": [FX, 0, 0, 0, FX, 0, CY, CX, 1], "frameTimestamps": [k / 60 for k in range(5)]}
+    return about | {"poses": [rows[k % 3] for k in range(5)]}
 
 
 def make_record3d(folder: Path) -> None:

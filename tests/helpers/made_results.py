@@ -8,46 +8,24 @@ from pathlib import Path
 import numpy as np
 
 from tofuse.engine.fusion.cloud import empty_cloud
+from tofuse.engine.geometry import se3
 from tofuse.engine.graph.graph import PoseGraph
 from tofuse.engine.results.types import Component, Diagnostics, FrameRecord, Reason, Reconstruction
 
 
 def result(seed=0) -> Reconstruction:
     trajectory = np.stack([np.eye(4), np.full((4, 4), np.nan)])
-    graph = PoseGraph(
-        np.array([0]),
-        np.eye(4)[None],
-        np.zeros((0, 2), np.intp),
-        np.zeros((0, 4, 4)),
-        np.zeros((0, 6, 6)),
-        np.zeros(0, bool),
-    )
+    graph = replace(PoseGraph.empty(), ids=np.array([0]), poses=np.eye(4)[None])
     frames = (
         FrameRecord(0, 0.0, "tracked", "", 0.5, None, np.float32(0.25), np.eye(6), np.ones((2, 6))),
         FrameRecord(1, 0.1, "lost", "no points", 0.0, float("nan"), float("inf")),
     )
-    diagnostics = Diagnostics(
-        "degraded",
-        (Reason("lost_frames", ((1, 1),), "Frame 1 has no pose."),),
-        frames,
-        (),
-        trajectory,
-        (),
-        {"median": 0.25},
-        {"tracking": 0.123456},
-    )
+    reasons = (Reason("lost_frames", ((1, 1),), "Frame 1 has no pose."),)
+    found = (reasons, frames, (), trajectory, (), {"median": 0.25}, {"tracking": 0.123456})
+    diagnostics = Diagnostics("degraded", *found)
     recording = {"path": "/somewhere", "format": "native", "frames": 2, "warnings": ["w"]}
-    return Reconstruction(
-        trajectory,
-        np.array([0.0, 0.1]),
-        graph,
-        empty_cloud(),
-        diagnostics,
-        {"method": "default"},
-        recording,
-        seed,
-        2,
-    )
+    made = (trajectory, np.array([0.0, 0.1]), graph, empty_cloud(), diagnostics)
+    return Reconstruction(*made, {"method": "default"}, recording, seed, 2)
 
 
 def torn(seed=0, parts=2) -> Reconstruction:
@@ -58,31 +36,20 @@ def torn(seed=0, parts=2) -> Reconstruction:
     whole = result(seed)
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[2:] = np.nan
-    frames = tuple(
-        FrameRecord(k, 0.1 * k, status, component=c)
-        for k, (status, c) in enumerate(
-            (("tracked", 0), ("tracked", 1), ("tracked", 2), ("lost", None))
-        )
-    )
-    T = np.eye(4)
-    T[0, 3] = 0.5
+    states = (("tracked", 0), ("tracked", 1), ("tracked", 2), ("lost", None))
+    frames = tuple(FrameRecord(k, 0.1 * k, s, component=c) for k, (s, c) in enumerate(states))
+    T = se3.translation([0.5, 0, 0])
     components = (
         Component(((0, 0),), np.eye(4), None),
         Component(((1, 1),), T, "links"),
         Component(((2, 2),), None, None, result(seed) if parts > 1 else None),
     )
-    return replace(
-        whole,
-        trajectory=poses,
-        timestamps=0.1 * np.arange(4),
-        diagnostics=replace(whole.diagnostics, frames=frames, sequential=poses),
-        components=components,
-    )
+    diagnostics = replace(whole.diagnostics, frames=frames, sequential=poses)
+    posed = {"trajectory": poses, "timestamps": 0.1 * np.arange(4), "diagnostics": diagnostics}
+    return replace(whole, **posed, components=components)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {
-        str(p.relative_to(folder)): p.read_bytes()
-        for p in folder.rglob("*")
-        if p.is_file() and not p.name.startswith(".tofuse-lock")
-    }
+    files = (p for p in folder.rglob("*") if p.is_file())
+    shown = (p for p in files if not p.name.startswith(".tofuse-lock"))
+    return {str(p.relative_to(folder)): p.read_bytes() for p in shown}

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from made_rooms import BOXES, CAMERA, Box, at, seen
+from made_rooms import BOXES, Box, at, seen
 from tofuse.apps.results.folders import OutputFolder
 from tofuse.apps.results.output import write_result
 from tofuse.engine.arrays import Float64
@@ -20,8 +20,8 @@ from tofuse.engine.mapping.methods import from_method
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.search.search_grid import SearchOptions
 from tofuse.formats.poses.trajectory import write_tum
-from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import Opening
+from written import record
 
 QUICK = SearchOptions("full", full_candidates=15, photometric_candidates=5)
 # Two walks that see the same corner of the room from opposite sides.
@@ -63,18 +63,9 @@ def made_result(folder: Path, path: Sequence[Float64], number: int, **scene: obj
 
 def recorded(folder: Path, frames: Iterable[RangeFrame]) -> Path:
     """Record these frames, ten per second."""
-    writer = RecordingWriter(
-        folder,
-        CAMERA,
-        depth_unit_m=0.0005,
-        depth_kind="z",
-        frame_rate_hz=10.0,
-        amplitude_kind="range_compensated",
-    )
-    for k, frame in enumerate(frames):
-        writer.add(replace(frame, index=k, timestamp=k / 10))
-    writer.finish()
-    return folder
+    timed = (replace(frame, index=k, timestamp=k / 10) for k, frame in enumerate(frames))
+    options = {"depth_unit_m": 0.0005, "amplitude_kind": "range_compensated"}
+    return record(folder, timed, frame_rate_hz=10.0, **options)
 
 
 def made_result_of(

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from pathlib import Path
 
 import numpy as np
 
 from made_phones import DEPTH, HEIGHT, WIDTH
-from tofuse.engine.cameras.cameras import Rational
+from tofuse.engine.cameras.cameras import Pinhole, Rational
 from tofuse.engine.geometry.rays import homogeneous
+from written import camera_json
 
 
 def make_arducam(folder: Path) -> None:
@@ -26,10 +26,7 @@ def make_arducam(folder: Path) -> None:
         confidence = np.full((HEIGHT, WIDTH), 40.0 + k, "<f4")
         confidence[1, :3] = (np.nan, 300, -1)
         (folder / f"confidence_{size}_{time + 3}.raw").write_bytes(confidence.tobytes())
-    about = {"schema": 1, "model": "pinhole", "width": WIDTH, "height": HEIGHT}
-    about |= {"fx": 30.0, "fy": 30.5, "cx": 15.5, "cy": 11.5}
-    about |= {"depth_unit_m": 0.001, "depth_kind": "z"}
-    (folder / "camera.json").write_text(json.dumps(about))
+    camera_json(folder / "camera.json", Pinhole(WIDTH, HEIGHT, 30.0, 30.5, 15.5, 11.5))
 
 
 # Of an ADTF3175 at 512 x 512, of which the frames are a part.

@@ -12,8 +12,8 @@ from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.poses.trajectory import write_tum
-from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.formats.recordings.open import Opening
+from written import record
 from written_run_json import write_run
 
 SIZE = (48, 36)
@@ -41,33 +41,21 @@ def plane(camera: Camera, k: int) -> np.ndarray:
     return np.round(np.nan_to_num(z, nan=0.0), 3).astype(np.float32)
 
 
-def made_result(folder: Path, camera: Camera, *, color: str = "color", config=None) -> Path:
+def made_result(folder: Path, camera: Camera, *, config=None) -> Path:
     """A recording of five frames, and a result with the poses of four of them."""
-    recording = folder / "scan"
-    writer = RecordingWriter(recording, camera)
+    frames = []
     for k in range(5):
         z = plane(camera, k)
-        images = {}
-        if color == "color":
-            image = np.zeros((*z.shape, 3), np.uint8)
-            image[..., 0], image[..., 1], image[..., 2] = 10 + k, np.arange(48), 200
-            images["color_image"] = image
-        elif color == "amplitude":
-            images["amplitude_image"] = np.where(z > 0, 4000 / np.maximum(z, 0.1) ** 2, 0)
-        writer.add(RangeFrame(k, 0.1 * k, camera, z, **images))
-    writer.finish()
+        image = np.zeros((*z.shape, 3), np.uint8)
+        image[..., 0], image[..., 1], image[..., 2] = 10 + k, np.arange(48), 200
+        frames.append(RangeFrame(k, 0.1 * k, camera, z, color_image=image))
+    recording = record(folder / "scan", frames)
     result = folder / "result"
     result.mkdir()
-    frames = [
-        {
-            "index": k,
-            "timestamp": 0.1 * k,
-            "status": "tracked" if k in POSED else "lost",
-            "component": 0 if k in POSED else None,
-            "covariance": None if k == 1 else (np.eye(6) * k).ravel().tolist(),
-        }
-        for k in range(5)
-    ]
+    frames = [{"index": k, "timestamp": 0.1 * k} for k in range(5)]
+    for k, frame in enumerate(frames):
+        seen = {"status": "tracked", "component": 0} if k in POSED else {"status": "lost"}
+        frame |= seen | {"covariance": None if k == 1 else (np.eye(6) * k).ravel().tolist()}
     write_tum(result / "trajectory.txt", 0.1 * np.array(POSED), POSES[POSED])
     points = np.random.default_rng(5).normal(size=(40, 3)).astype(np.float32)
     write_ply(result / "cloud.ply", GeometryRecord(points, color=np.full((40, 3), 77, np.uint8)))

@@ -63,16 +63,13 @@ def make_room(frames=24, width=64, height=48):
         FrameRecord(k, k / 10, "tracked", "", 0.97, 0.7 + 0.1 * np.sin(k / 3), 0.011)
         for k in range(frames)
     ]
-    records[5] = FrameRecord(
-        5, 0.5, "predicted", "a flat wall holds only 3 of 6 directions", 0.9, 0.4, 0.03
-    )
+    wall = "a flat wall holds only 3 of 6 directions"
+    records[5] = FrameRecord(5, 0.5, "predicted", wall, 0.9, 0.4, 0.03)
+    few = "too few correspondences: 31 of 1000"
     for k in (9, 10):
-        records[k] = FrameRecord(
-            k, k / 10, "lost", "too few correspondences: 31 of 1000", 0.8, 0.031, 0.09
-        )
-        estimate[k] = sequential[k] = np.nan
+        records[k] = FrameRecord(k, k / 10, "lost", few, 0.8, 0.031, 0.09)
     records[15] = FrameRecord(15, 1.5, "skipped", "depth/000015.png: is truncated")
-    estimate[15] = sequential[15] = np.nan
+    estimate[[9, 10, 15]] = sequential[[9, 10, 15]] = np.nan
     loops = (
         LoopRecord(0, frames - 1, True, "", 0.62, 0.014, 0.01),
         LoopRecord(2, frames - 2, False, "overlap is below 25 %", 0.18, 0.05, None),
@@ -81,76 +78,42 @@ def make_room(frames=24, width=64, height=48):
     samples = tuple(
         FrameSample.of(v, v, v.keep(np.asarray(v.amplitude_image > 700))) for v in views[:15:2]
     )
-    diagnostics = Diagnostics(
-        "degraded",
-        (
-            Reason("lost_frames", ((9, 10),), "2 readable frames have no pose"),
-            Reason("unreadable_frames", ((15, 15),), "1 frame could not be read and was skipped"),
-        ),
-        tuple(records),
-        loops,
-        sequential,
-        objective,
-        {"confidence": 0.081, "neighbours": 0.5},
-        {
-            "read": 0.31,
-            "filter": 0.92,
-            "odometry": 2.4,
-            "loops": 0.6,
-            "optimise": 0.05,
-            "fuse": 0.4,
-        },
-        samples=samples,
+    reasons = (
+        Reason("lost_frames", ((9, 10),), "2 readable frames have no pose"),
+        Reason("unreadable_frames", ((15, 15),), "1 frame could not be read and was skipped"),
     )
+    removed = {"confidence": 0.081, "neighbours": 0.5}
+    seconds = {"read": 0.31, "filter": 0.92, "odometry": 2.4, "loops": 0.6, "fuse": 0.4}
+    records = tuple(records)
+    found = (reasons, records, loops, sequential, objective, removed, seconds)
+    diagnostics = Diagnostics("degraded", *found, samples=samples)
     cloud = builder.finish()
     sigma = (0.002 + 0.004 * np.linalg.norm(cloud.points, axis=1)).astype(np.float32)
-    result = Reconstruction(
-        estimate,
-        np.arange(frames) / 10,
-        PoseGraph.empty(),
-        replace(cloud, sigma=sigma),
-        diagnostics,
-        {"method": "thesis", "filters": [{"part": "confidence", "minimum": 4}]},
-        {"path": "room", "format": "native", "frames": frames, "warnings": ["no timestamps.txt"]},
-        7,
-        2,
-    )
+    cloud = replace(cloud, sigma=sigma)
+    config = {"method": "thesis", "filters": [{"part": "confidence", "minimum": 4}]}
+    about = {"path": "room", "format": "native", "frames": frames}
+    about |= {"warnings": ["no timestamps.txt"]}
+    made = (estimate, np.arange(frames) / 10, PoseGraph.empty(), cloud, diagnostics)
+    result = Reconstruction(*made, config, about, 7, 2)
     raw = views[0]
     step1 = raw.keep(np.asarray(raw.amplitude_image > 700))
     step2 = step1.keep(rng.random(step1.valid.shape) < 0.5)
     surface = rng.uniform(*ROOM, (4000, 3))
     axis = rng.integers(0, 3, 4000)
     surface[np.arange(4000), axis] = ROOM[rng.integers(0, 2, 4000), axis]
-    extras = ReportExtras(
-        "room <simulated>",
-        (("raw", raw), ("confidence", step1), ("neighbours", step2)),
-        truth,
-        surface.astype(np.float32),
-    )
-    return result, extras
+    steps = (("raw", raw), ("confidence", step1), ("neighbours", step2))
+    return result, ReportExtras("room <simulated>", steps, truth, surface.astype(np.float32))
 
 
 def lonely(**changes):
     """A minimal result: one frame, and a cloud without attributes."""
-    cloud = Cloud(
-        np.array([[0, 0, 1], [0.1, 0, 1], [0, 0.2, 1.1]], np.float32),
-        None,
-        None,
-        np.ones(3, np.int32),
-    )
-    diagnostics = Diagnostics(
-        "good",
-        (Reason("single_frame", ((0, 0),), ""),),
-        (FrameRecord(0, 0.0, "tracked"),),
-        (),
-        np.eye(4)[None],
-        (),
-        {},
-        {},
-    )
-    whole = Reconstruction(
-        np.eye(4)[None], np.zeros(1), PoseGraph.empty(), cloud, diagnostics, {}, {}, 0, 1
-    )
+    points = np.array([[0, 0, 1], [0.1, 0, 1], [0, 0.2, 1.1]], np.float32)
+    cloud = Cloud(points, None, None, np.ones(3, np.int32))
+    reasons, frames = (Reason("single_frame", ((0, 0),), ""),), (FrameRecord(0, 0.0, "tracked"),)
+    pose = np.eye(4)[None]
+    diagnostics = Diagnostics("good", reasons, frames, (), pose, (), {}, {})
+    graph = PoseGraph.empty()
+    whole = Reconstruction(pose, np.zeros(1), graph, cloud, diagnostics, {}, {}, 0, 1)
     inner = {k: v for k, v in changes.items() if k in Diagnostics.__dataclass_fields__}
     outer = {k: v for k, v in changes.items() if k not in inner}
     return replace(whole, **outer, diagnostics=replace(diagnostics, **inner))

@@ -73,43 +73,42 @@ class Bag:
         first = (7,) if self.kind == "ros1" else ()
         return self.make("std_msgs/msg/Header", *first, stamp, frame)
 
-    def motion(self, T: np.ndarray) -> Any:
-        q = quaternion.from_matrix(T[:3, :3])
-        vector = self.make("geometry_msgs/msg/Vector3", *map(float, T[:3, 3]))
-        turn = self.make("geometry_msgs/msg/Quaternion", *map(float, q))
-        return self.make("geometry_msgs/msg/Transform", vector, turn)
+    def vector(self, kind: str, values: Any) -> Any:
+        return self.make(f"geometry_msgs/msg/{kind}", *map(float, values))
+
+    def motion(self, T: np.ndarray) -> tuple[Any, Any]:
+        turn = self.vector("Quaternion", quaternion.from_matrix(T[:3, :3]))
+        return self.vector("Vector3", T[:3, 3]), turn
 
     def tf(self, topic: str, time: float, parent: str, child: str, T: np.ndarray) -> None:
+        motion = self.make("geometry_msgs/msg/Transform", *self.motion(T))
         kind = "geometry_msgs/msg/TransformStamped"
-        stamped = self.make(kind, self.header(time, parent), child, self.motion(T))
-        name = "tf2_msgs/msg/TFMessage"
-        self.write(topic, name, time, self.make(name, [stamped]))
+        stamped = self.make(kind, self.header(time, parent), child, motion)
+        self.write(topic, "tf2_msgs/msg/TFMessage", time, [stamped])
 
     def imu(
         self, topic: str, time: float, frame: str, acceleration: np.ndarray, known: float = 0.0
     ) -> None:
         zero, covariance = np.zeros(9), np.array([known, *np.zeros(8)])
-        vector = self.store.types["geometry_msgs/msg/Vector3"]
-        turn = self.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
-        speed, pull = vector(0.0, 0.0, 0.0), vector(*map(float, acceleration))
-        values = (self.header(time, frame), turn, zero, speed, zero, pull, covariance)
-        self.write(topic, "sensor_msgs/msg/Imu", time, self.make("sensor_msgs/msg/Imu", *values))
+        speed, turn = self.motion(np.eye(4))
+        values = (turn, zero, speed, zero, self.vector("Vector3", acceleration), covariance)
+        self.write(topic, "sensor_msgs/msg/Imu", time, self.header(time, frame), *values)
 
     def odometry(self, topic: str, time: float, parent: str, child: str, T: np.ndarray) -> None:
-        q, zero = quaternion.from_matrix(T[:3, :3]), np.zeros(36)
-        point = self.make("geometry_msgs/msg/Point", *map(float, T[:3, 3]))
-        turn = self.make("geometry_msgs/msg/Quaternion", *map(float, q))
-        still = self.make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
-        pose = self.make("geometry_msgs/msg/Pose", point, turn)
-        speed = self.make("geometry_msgs/msg/Twist", still, still)
+        still = self.vector("Vector3", np.zeros(3))
+        parts = {
+            "Pose": (self.vector("Point", T[:3, 3]), self.motion(T)[1]),
+            "Twist": (still, still),
+        }
         values = (
-            self.make("geometry_msgs/msg/PoseWithCovariance", pose, zero),
-            self.make("geometry_msgs/msg/TwistWithCovariance", speed, zero),
+            self.make(f"{name}WithCovariance", self.make(name, *part), np.zeros(36))
+            for name, part in ((f"geometry_msgs/msg/{n}", part) for n, part in parts.items())
         )
-        name = "nav_msgs/msg/Odometry"
-        self.write(topic, name, time, self.make(name, self.header(time, parent), child, *values))
+        header = self.header(time, parent)
+        self.write(topic, "nav_msgs/msg/Odometry", time, header, child, *values)
 
-    def write(self, topic: str, kind: str, time: float, message: Any) -> None:
+    def write(self, topic: str, kind: str, time: float, *values: Any) -> None:
+        message = self.make(kind, *values)
         if topic not in self.connections:
             self.connections[topic] = self.writer.add_connection(topic, kind, typestore=self.store)
         turn = self.store.serialize_ros1 if self.kind == "ros1" else self.store.serialize_cdr
@@ -130,25 +129,23 @@ class Bag:
         height, width = len(image), width or image.shape[1]
         rows = np.ascontiguousarray(image).view(np.uint8).reshape(height, -1)
         rows = np.pad(rows, ((0, 0), (0, pad)))
-        self.write(
-            topic,
-            ros.IMAGE,
-            time,
-            self.make(
-                ros.IMAGE, self.header(time, frame), height, width, encoding, 0, rows.shape[1],
-                rows.ravel(),
-            ),
-        )  # fmt: skip
+        size = (height, width, encoding, 0, rows.shape[1])
+        self.write(topic, ros.IMAGE, time, self.header(time, frame), *size, rows.ravel())
+
+    def depth(self, topic: str = TOPIC, count: int = 1, **lens: Any) -> None:
+        """Depth images 0.1 s apart, and the lens beside them."""
+        self.info(f"{topic.rpartition('/')[0]}/camera_info", **{"D": (), **lens})
+        for k in range(count):
+            self.image(topic, 10 + 0.1 * k, COUNTS[k], "16UC1")
 
     def compressed(
         self, topic: str, time: float, data: bytes, format_: str, frame: str = "depth"
     ) -> None:
         content = np.frombuffer(data, np.uint8)
-        message = self.make(ros.COMPRESSED, self.header(time, frame), format_, content)
-        self.write(topic, ros.COMPRESSED, time, message)
+        self.write(topic, ros.COMPRESSED, time, self.header(time, frame), format_, content)
 
     def transform(self, topic: str, T: np.ndarray) -> None:
-        self.write(topic, "geometry_msgs/msg/Transform", 1.0, self.motion(T))
+        self.write(topic, "geometry_msgs/msg/Transform", 1.0, *self.motion(T))
 
     def info(
         self,
@@ -167,7 +164,7 @@ class Bag:
         size = (lens.height, lens.width)
         values = (*size, model, np.array(D), K, np.eye(3).ravel())
         values = (*values, np.zeros(12) if P is None else P.ravel(), *binning, window)
-        self.write(topic, ros.INFO, 10.0, self.make(ros.INFO, self.header(10.0), *values))
+        self.write(topic, ros.INFO, 10.0, self.header(10.0), *values)
 
     def cloud(
         self,
@@ -193,11 +190,9 @@ class Bag:
         rows = data.reshape(height, -1)
         rows = np.pad(rows, ((0, 0), (0, pad * len(fields))), constant_values=9)
         content = np.frombuffer(rows.tobytes(), np.uint8)
-        message = self.make(
-            ros.CLOUD, self.header(time), height, len(data) // height, fields, dtype[0] == ">",
-            len(fields) * size, len(content) // height, content, True,
-        )  # fmt: skip
-        self.write(topic, ros.CLOUD, time, message)
+        values = (height, len(data) // height, fields, dtype[0] == ">", len(fields) * size)
+        header = self.header(time)
+        self.write(topic, ros.CLOUD, time, header, *values, len(content) // height, content, True)
 
     def close(self) -> Path:
         self.writer.close()
@@ -247,8 +242,7 @@ def real_sense(
     text, number = "std_msgs/msg/String", "std_msgs/msg/Float32"
     if kind == "ros1":
         bag.info(f"{stream}/info/camera_info", model, D if model != "None" else (0.0,))
-        bag.write("/device_0/sensor_0/option/Depth_Units/value", number, 1.0,
-                  bag.make(number, 0.00025))  # fmt: skip
+        bag.write("/device_0/sensor_0/option/Depth_Units/value", number, 1.0, 0.00025)
         if color:
             bag.info(COLOR_STREAM + "/info/camera_info", "Brown Conrady", distortion, COLOR_LENS)
             for part, T in ((stream, T_DEPTH), (COLOR_STREAM, T_COLOR)):
@@ -256,22 +250,19 @@ def real_sense(
     else:
         coeffs = ",".join(map(str, D if model != "None" else (0,) * 5))
         lens = f"width=16;height=12;fx=20;ppx=7.5;fy=21;ppy=5.5;model={model};coeffs={coeffs}"
-        bag.write(f"{stream}/camera_info", text, 1.0, bag.make(text, lens))
+        bag.write(f"{stream}/camera_info", text, 1.0, lens)
         if color:
             coeffs = ",".join(map(str, distortion))
             lens = "width=48;height=40;fx=40;ppx=23;fy=41;ppy=20;model=Inverse Brown Conrady;"
-            bag.write(
-                COLOR_STREAM + "/camera_info", text, 1.0, bag.make(text, f"{lens}coeffs={coeffs}")
-            )
+            bag.write(f"{COLOR_STREAM}/camera_info", text, 1.0, f"{lens}coeffs={coeffs}")
             for part, T in ((stream, T_DEPTH), (COLOR_STREAM, T_COLOR)):
                 extrinsics = "rotation=" + ",".join(map(str, T[:3, :3].T.ravel()))  # by columns
                 extrinsics += ";translation=" + ",".join(map(str, T[:3, 3]))
-                bag.write(f"{part}/tf/0", text, 1.0, bag.make(text, extrinsics))
-        bag.write("/device_0/sensor_0/option/Depth_Units/value", text, 1.0,
-                  bag.make(text, "0.000250"))  # fmt: skip
+                bag.write(f"{part}/tf/0", text, 1.0, extrinsics)
+        bag.write("/device_0/sensor_0/option/Depth_Units/value", text, 1.0, "0.000250")
     pair = "diagnostic_msgs/msg/KeyValue"
     for key, value in (("Serial Number", "f0001"), ("Name", name)):
-        bag.write("/device_0/info", pair, 1.0, bag.make(pair, key, value))
+        bag.write("/device_0/info", pair, 1.0, key, value)
     for k in range(3):
         bag.image(f"{stream}/image/data", 10 + k / 30, STEP if color else COUNTS[k], "mono16")
         if color and k != 1:

@@ -22,16 +22,11 @@ def run_json(result: Reconstruction) -> dict[str, Any]:
 
 
 _FIELDS: dict[str, Any] = {
-    "schema": 1,
-    "version": __version__,
-    "verdict": "good",
-    "seed": 0,
+    "schema": 1, "version": __version__, "verdict": "good", "seed": 0,
     "accuracy": {"position_m": None, "rotation_rad": None, "relative": None},
-    "reasons": [],
-    "frames": [],
+    "reasons": [], "frames": [], "components": [],
     "T_up_world": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
-    "components": [],
-}
+}  # fmt: skip
 _FRAME = {"status": "tracked", "component": None, "covariance": None}
 
 
@@ -48,6 +43,13 @@ def change_run(folder: Path, **changes: Any) -> None:
     run = read_run_json(folder / "run.json") | changes
     del run["sha256"]
     _write(folder, {name: value for name, value in run.items() if value is not None})
+
+
+def read_from(folder: Path, recording: Path, **changes: Any) -> None:
+    """Change where the recording of a result is."""
+    given = read_run_json(folder / "run.json")["input"]
+    given["opening"]["paths"] = [str(recording)]
+    change_run(folder, input=given, **changes)
 
 
 def _write(folder: Path, run: dict[str, Any]) -> None:

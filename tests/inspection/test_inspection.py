@@ -14,8 +14,8 @@ import pytest
 
 import made_rooms
 import tofuse
+from cli_calls import printed
 from ray_casting import rays_at, to_room, to_walls
-from tofuse.apps.cli.program import main
 from tofuse.apps.inspection.channels import (
     _correlations,
     _delay,
@@ -34,10 +34,10 @@ from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality.pose_accuracy import Accuracy, WorstFrame
 from tofuse.engine.results.types import Reason, SelfCalibration
-from tofuse.formats.recordings.native import RecordingWriter
 from tofuse.lab.simulation.effects import Effects
 from tofuse.lab.simulation.record import plan
 from wrapped_depth import wrapping
+from written import change_camera, record
 
 CAMERA = Pinhole(40, 30, 40.0, 40.0, 19.5, 14.5)
 
@@ -60,12 +60,8 @@ def copy(room_recording, tmp_path) -> Path:
 
 def written(folder: Path, frames, **changes) -> Path:
     """A native recording of the frames, with changed entries of its camera.json."""
-    writer = RecordingWriter(folder, frames[0].camera, frame_rate_hz=10.0)
-    for frame in frames:
-        writer.add(frame)
-    writer.finish()
-    camera = json.loads((folder / "camera.json").read_text())
-    (folder / "camera.json").write_text(json.dumps(camera | changes))
+    record(folder, frames, frame_rate_hz=10.0)
+    change_camera(folder, **changes)
     return folder
 
 
@@ -110,9 +106,8 @@ def test_facts_of_synthetic_frames() -> None:
 def test_wrong_unit_is_detected(z) -> None:
     remedies = "Check depth_unit_m", f"multiply those in the files by {2 / z:g}"
     for frame, remedy in zip((image(z), CloudFrame.of(image(z).points)), remedies, strict=True):
-        (warning,) = (
-            str(f) for f in inspect_recording(of([frame])).findings if f.code == "depth_unit"
-        )
+        found = inspect_recording(of([frame])).findings
+        (warning,) = (str(f) for f in found if f.code == "depth_unit")
         assert remedy in warning
         assert f"{z:.2g}"[:1] in warning
 
@@ -122,9 +117,8 @@ def test_clouds_in_different_units_are_detected() -> None:
         points = image(2.0).points
         return of([CloudFrame.of(f * points, index=k) for k, f in enumerate(factors)])
 
-    finding = next(
-        f for f in inspect_recording(clouds(1, 1000, 1)).findings if f.code == "depth_unit"
-    )
+    found = inspect_recording(clouds(1, 1000, 1)).findings
+    finding = next(f for f in found if f.code == "depth_unit")
     assert "median distance of frame 1 is" in finding.text
     assert finding.remedy.endswith("these frames by 0.001.")
     # Of two, either may be meant; near and far scans of one place differ less.
@@ -160,12 +154,10 @@ def test_unreadable_frames_give_warning(copy) -> None:
 
 def test_warnings_of_the_reader_are_reported(tmp_path, capsys) -> None:
     folder = written(tmp_path / "rec", [image(2.0), image(2.0, 1)], **{"colour[x]": "grey"})
-    assert main(["inspect", str(folder), "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
+    data = json.loads(printed(capsys, "inspect", folder, "--json"))
     assert set(data) == {"facts", "findings", "warnings"}
     assert any("colour[x]" in w for w in data["warnings"])
-    assert main(["inspect", str(folder)]) == 0
-    reported = capsys.readouterr().out
+    reported = printed(capsys, "inspect", folder)
     assert "colour[x]" in reported  # brackets are not interpreted as markup
     assert "\\" not in reported
 
@@ -318,13 +310,10 @@ def test_wraps_are_severe_where_they_may_be_the_majority(scene, every, code) -> 
 def test_swapped_bytes_are_detected() -> None:
     v, u = np.mgrid[:72, :96]
     counts = [(1500 + 3 * u + 2 * v + 40 * k).astype(np.uint16) for k in range(4)]
-    right = [
-        RangeFrame(k, k / 10, BROWN, c.astype(np.float32) / 1000) for k, c in enumerate(counts)
-    ]
-    swapped = [
-        replace(f, depth=c.byteswap().astype(np.float32) / 1000)
-        for f, c in zip(right, counts, strict=True)
-    ]
+    right, swapped = (
+        [RangeFrame(k, k / 10, BROWN, c.astype(np.float32) / 1000) for k, c in enumerate(images)]
+        for images in (counts, [c.byteswap() for c in counts])
+    )
     found = {f.code: f for f in tofuse.inspect(of(swapped)).findings}
     assert "bytes" in found["depth_unit"].text
     assert "depth_unit" not in codes(right)
@@ -407,18 +396,11 @@ def test_flat_images_are_inspected(turn) -> None:
     """Those of a spinning scanner, too flat for shifts of a fraction of the width."""
     camera = turn[0].camera
     flat = Pinhole(camera.width, 16, camera.fx, camera.fy, camera.cx, camera.cy - 30)
-    frames = [
-        RangeFrame(
-            f.index,
-            f.timestamp,
-            flat,
-            f.depth[30:46],
-            f.depth_kind,
-            amplitude_image=f.amplitude_image[30:46],
-            color_image=np.ascontiguousarray(f.color_image[30:46]),
-        )
-        for f in colored(turn, 0)
-    ]
+    frames = []
+    for f in colored(turn, 0):
+        names = ("amplitude_image", "color_image")
+        images = {name: np.ascontiguousarray(getattr(f, name)[30:46]) for name in names}
+        frames.append(RangeFrame(f.index, f.timestamp, flat, f.depth[30:46], **images))
     assert not codes(frames) & {"mirrored", "color_unregistered", "delayed"}
 
 
@@ -427,14 +409,9 @@ def test_colors_of_other_frames_are_not_mirrored(turn) -> None:
     images = [f.color_image for f in colored(turn, 0)]
     for shift in (4, 7, 9):
         for flip in (np.s_[:], np.s_[:, ::-1], np.s_[::-1]):
-            frames = [
-                replace(
-                    f,
-                    amplitude_image=None,
-                    color_image=np.ascontiguousarray(images[(k + shift) % len(images)][flip]),
-                )
-                for k, f in enumerate(turn)
-            ]
+            others = [np.ascontiguousarray(image[flip]) for image in np.roll(images, -shift, 0)]
+            pairs = zip(turn, others, strict=True)
+            frames = [replace(f, amplitude_image=None, color_image=c) for f, c in pairs]
             assert not list(check_mirrored(Sample.of(of(frames), 8)))
 
 
@@ -501,12 +478,10 @@ def test_the_image_hardly_moves_around_an_object() -> None:
     turn = se3.exp(np.array([0, 0, 0, 0, np.radians(15), 0]))
     to_object = se3.exp(np.array([0, 0, 1.0, 0, 0, 0]))
     around = to_object @ turn @ se3.inverse(to_object)
-    shifts = [
-        replace(pair, alignment=replace(pair.alignment, T_world_source=T)).shift
-        for T in (turn, around)
-    ]
-    assert shifts[0] == pytest.approx(np.tan(np.radians(15)) / 0.75, rel=0.15)
-    assert shifts[1] < 0.1
+    poses = [replace(pair.alignment, T_world_source=T) for T in (turn, around)]
+    first, second = (replace(pair, alignment=pose).shift for pose in poses)
+    assert first == pytest.approx(np.tan(np.radians(15)) / 0.75, rel=0.15)
+    assert second < 0.1
 
 
 def test_camera_motion_is_classified() -> None:
@@ -578,9 +553,7 @@ def test_wraps_behind_rotating_object_do_not_affect_verdict(result: tofuse.Resul
         ("lens_distortion", (0.0, 0.0, 0.0, 0.0, 0.03), (0.0, 0.0, 0.02, 0.0, 0.0)),
     ],
 )
-def test_corrected_intrinsics_do_not_affect_verdict(
-    result: tofuse.Result, code: str, harmless, severe
-) -> None:
+def test_corrected_intrinsics_do_not_affect_verdict(result, code, harmless, severe) -> None:
     wrong = Finding(code, "It is that of another camera.", "Use the right one.", {})
 
     def faults(errors: tuple[float, ...]) -> list[str]:
@@ -597,9 +570,7 @@ def test_corrected_intrinsics_do_not_affect_verdict(
 @pytest.mark.parametrize(
     ("factor", "corrected"), [(0.95, True), (0.97, True), (0.83, False), (1.05, False)]
 )
-def test_focal_length_is_corrected_only_as_finding_says(
-    result: tofuse.Result, factor: float, corrected: bool
-) -> None:
+def test_focal_length_is_corrected_only_as_finding_says(result, factor, corrected) -> None:
     """A focal length and an offset trade off: the correction may be of another amount."""
     wrong = Finding("focal_length", "Wrong.", "Use it.", {"factor": factor, "sigma": 0.01})
     calibrated = SelfCalibration(0.05, 0.1, 0.0, 0.0, 0.0, {"focal": 0.002}, (0.1, 0.01))

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import tofuse
-from cli_calls import call, listing, refuses
+from cli_calls import call, listing, printed, refuses
 from made_rooms import OTHER, at, seen
 from made_sessions import HERE, recorded
+from refused import refused
 from tofuse.apps.jobs import locating
-from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
@@ -23,6 +23,7 @@ from tofuse.engine.mapping import clips
 from tofuse.engine.progress import Silent
 from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.poses.trajectory import read_tum
+from written_run_json import read_from
 
 # A second pass, beside and above the first one.
 AGAIN = [at(0.1 + 0.02 * k, 0.1, 0.05 + 0.1 * k, 0.25, -0.05) for k in range(6)]
@@ -80,13 +81,11 @@ def test_single_frame_is_corrected_like_its_recording(
     session_results, clip, capsys, monkeypatch
 ) -> None:
     """A frame of another camera, without its noise model, would count as exact."""
-    monkeypatch.setattr(
-        locating.ResultMap,
-        "locate_frame",
-        lambda _, frame, recording: locating.LocatedFrame(
-            frame.index, 0, None, str(len(recording))
-        ),
-    )
+
+    def counted(_, frame, recording):
+        return locating.LocatedFrame(frame.index, 0, None, str(len(recording)))
+
+    monkeypatch.setattr(locating.ResultMap, "locate_frame", counted)
     assert call("locate", session_results["here"], f"{clip}#3") == 3
     assert call("locate", session_results["here"], clip, "--start", 3, "--end", 4) == 3
     lines = capsys.readouterr().out.splitlines()
@@ -174,8 +173,7 @@ def test_motion_in_a_clip_knows_what_tracking_did_not_constrain() -> None:
 
 
 def test_one_frame_of_a_recording(session_results, clip, capsys) -> None:
-    assert call("locate", session_results["here"], f"{clip}#3") == 0
-    done = capsys.readouterr().out
+    done = printed(capsys, "locate", session_results["here"], f"{clip}#3")
     assert done.startswith("accepted frame 3; at (")
     assert "probability" in done
     assert done.endswith("1 of 1 frames located\n")
@@ -213,24 +211,20 @@ def test_cloud_is_registered_with_points_of_the_map(session_results, tmp_path, c
 
 def test_python_refuses_cloud(here) -> None:
     cloud = CloudFrame(0, 0.0, np.zeros((20, 3), np.float32))
-    with pytest.raises(InputError, match=r"is a cloud.*tofuse\.register"):
-        here.locate(cloud)
+    refused(r"is a cloud.*tofuse\.register", cloud, by=here.locate)
 
 
 def test_missing_recording_is_named(session_results, clip, tmp_path, capfd) -> None:
     folder = tmp_path / "result"
     shutil.copytree(session_results["here"], folder)
-    run = json.loads((folder / "run.json").read_text())
-    run["input"]["opening"]["paths"] = [str(tmp_path / "gone")]
-    (folder / "run.json").write_text(json.dumps(run))
+    read_from(folder, tmp_path / "gone")
     says = (f"{tmp_path / 'gone'}, which doesn't exist", "put it back")
-    refuses(capfd, "locate", "--edited", folder, clip, says=says)
+    refuses(capfd, "locate", folder, clip, says=says)
 
 
 def test_errors_are_one_line(session_results, clip, tmp_path, capfd) -> None:
     refuses(capfd, "locate", tmp_path, clip, says=(str(tmp_path),))
     refuses(capfd, "locate", session_results["here"], tmp_path / "no", says=("no",))
-    refuses(
-        capfd, "locate", session_results["here"], f"{clip}#77", says=("has no frame 77", "0 to 5")
-    )
-    refuses(capfd, "locate", session_results["here"], clip, "--overwrite", says=("requires --out",))
+    here = session_results["here"]
+    refuses(capfd, "locate", here, f"{clip}#77", says=("has no frame 77", "0 to 5"))
+    refuses(capfd, "locate", here, clip, "--overwrite", says="requires --out")

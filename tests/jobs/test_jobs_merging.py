@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import made_sessions
+from cli_calls import printed, refuses
 from made_rooms import at, seen
 from made_sessions import made_result_of, quick
-from tofuse.apps.cli.program import main
 from tofuse.apps.export.exporting import export
 from tofuse.apps.jobs import merging
 from tofuse.apps.jobs.merging import joined_recording, merge_sessions, merged_config
@@ -31,8 +31,8 @@ from tofuse.engine.graph.external_sensors import OdometryEdges
 from tofuse.engine.progress import Silent
 from tofuse.formats.geometry import read_textured_glb
 from tofuse.formats.poses.trajectory import read_tum, write_tum
-from tofuse.formats.recordings.native import RecordingWriter
-from written_run_json import change_run, run_json
+from written import record
+from written_run_json import change_run, read_from, run_json
 
 HERE, THERE = made_sessions.HERE[::2], made_sessions.THERE[::2]
 N = len(HERE)
@@ -68,6 +68,11 @@ def copied(folder: Path, to: Path) -> Path:
     """A result next to its recording, in another folder."""
     shutil.copytree(folder, to / "out")
     return to / "out"
+
+
+def recording_of(folder: Path) -> str:
+    (path,) = json.loads((folder / "run.json").read_text())["input"]["opening"]["paths"]
+    return path
 
 
 def test_two_sessions_in_one_room_give_one_map(both) -> None:
@@ -114,10 +119,8 @@ def test_session_of_a_camera_on_its_side_is_joined(session_results, tmp_path) ->
     change_run(side, T_up_world=upright.tolist())  # as a phone measures it
     sessions = read_sessions([session_results["here"], side], 2, Silent())
     assert [s.roll for s in sessions] == pytest.approx([0, -np.pi / 2], abs=0.1)
-    config = quick_merge(sessions)
-    config = replace(
-        config, search=replace(config.search, roll=merged_config(sessions).search.roll)
-    )
+    config, roll = quick_merge(sessions), merged_config(sessions).search.roll
+    config = replace(config, search=replace(config.search, roll=roll))
     found = merge_sessions(sessions, config, threads=2)
     true = se3.inverse(HERE[0]) @ np.array([*HERE, *turned])
     assert found.has_pose.all()
@@ -129,9 +132,8 @@ def test_run_json_states_session_of_each_frame(both, session_results) -> None:
     data = run_json(both)
     assert [frame["session"] for frame in data["frames"]] == [0] * N + [1] * N
     assert [s["name"] for s in data["sessions"]] == ["here", "there"]
-    assert [s["result"] for s in data["sessions"]] == [
-        str(session_results[k]) for k in ("here", "there")
-    ]
+    folders = [str(session_results[name]) for name in ("here", "there")]
+    assert [s["result"] for s in data["sessions"]] == folders
     assert [s["first"] for s in data["sessions"]] == [0, N]
     assert data["session_pairs"][0]["joined"]
 
@@ -182,13 +184,7 @@ def test_loops_of_earlier_merge_are_registered_again(both, session_results, pair
 def test_command_writes_result(session_results, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(merging, "merged_config", quick_merge)
     out = tmp_path / "all"
-    words = [
-        "merge",
-        str(session_results["here"]),
-        str(session_results["there"]),
-        "--out",
-        str(out),
-    ]
+    words = ["merge", session_results["here"], session_results["there"], "--out", out]
     painted = []
 
     def painting(mesh, views, poses, size):
@@ -196,8 +192,7 @@ def test_command_writes_result(session_results, tmp_path, monkeypatch, capsys) -
         return textured(mesh, views, poses, size // 8)  # a small texture
 
     monkeypatch.setattr(texture, "textured", painting)
-    assert main([*words, "--threads", "2", "--texture"]) == 0
-    assert "here and there overlap" in capsys.readouterr().out
+    assert "here and there overlap" in printed(capsys, *words, "--threads", "2", "--texture")
     assert painted == [2 * N]  # views of both
     assert read_textured_glb(out / "mesh.glb") is not None
     times, poses = read_tum(out / "trajectory.txt")
@@ -208,8 +203,7 @@ def test_command_writes_result(session_results, tmp_path, monkeypatch, capsys) -
     report = (out / "report.html").read_text()
     assert "here, there merged" in report
     assert "Sessions" in report
-    assert main(words) == 2  # holds a result already
-    assert "overwrite" in capsys.readouterr().err
+    refuses(capsys, *words, says="overwrite")
 
 
 def refused(folders, *parts) -> None:
@@ -230,22 +224,16 @@ def test_bad_input_is_refused_in_one_line(session_results, tmp_path) -> None:
     copied(here, tmp_path)
     refused([here, tmp_path / "out"], "same recording", f"{N} frames are in both")
     # Of a copy of the recording, too.
-    run = json.loads((tmp_path / "out" / "run.json").read_text())
-    (path,) = run["input"]["opening"]["paths"]
-    shutil.copytree(path, tmp_path / "copy")
-    run["input"]["opening"]["paths"] = [str(tmp_path / "copy")]
-    change_run(tmp_path / "out", input=run["input"])
+    shutil.copytree(recording_of(here), tmp_path / "copy")
+    read_from(tmp_path / "out", tmp_path / "copy")
     refused([here, tmp_path / "out"], "same recording", f"{N} frames are in both")
 
 
 def test_missing_recording_is_named_with_remedy(session_results, tmp_path) -> None:
     again = copied(session_results["there"], tmp_path)
-    run = json.loads((again / "run.json").read_text())
-    run["input"]["opening"]["paths"] = [str(tmp_path / "was-here")]
-    change_run(again, input=run["input"])
-    refused(
-        [session_results["here"], again], str(tmp_path / "was-here"), "doesn't exist", "put it back"
-    )
+    gone = tmp_path / "was-here"
+    read_from(again, gone)
+    refused([session_results["here"], again], str(gone), "doesn't exist", "put it back")
 
 
 def test_exported_images_have_the_times_of_the_map(pair, tmp_path) -> None:
@@ -262,37 +250,27 @@ def test_changed_recording_is_refused(session_results, tmp_path) -> None:
     times, poses = read_tum(again / "trajectory.txt")
     write_tum(again / "trajectory.txt", times + 1.0, poses)
     change_run(again, frames=frames)
-    refused(
-        [session_results["here"], again],
-        "does not match the frames",
-        "has changed",
-        "run `tofuse run` again",
-    )
+    says = ("does not match the frames", "has changed", "run `tofuse run` again")
+    refused([session_results["here"], again], *says)
 
 
 def test_recording_with_other_images_is_refused(session_results, tmp_path) -> None:
     again = copied(session_results["there"], tmp_path)
-    run = json.loads((again / "run.json").read_text())
-    scan = shutil.copytree(run["input"]["opening"]["paths"][0], tmp_path / "scan")
+    scan = shutil.copytree(recording_of(again), tmp_path / "scan")
     depth = sorted((scan / "depth").iterdir())
     depth[-1].replace(depth[0])
     shutil.copy(depth[1], depth[-1])
-    run["input"]["opening"]["paths"] = [str(scan)]
-    change_run(again, input=run["input"])
+    read_from(again, scan)
     refused([session_results["here"], again], "at frame 0, which has changed")
 
 
 def test_results_of_clouds_are_refused(session_results, tmp_path) -> None:
-    writer = RecordingWriter(tmp_path / "clouds", None, frame_rate_hz=10.0)
     points = np.random.default_rng(0).uniform(1, 2, (50, 3)).astype(np.float32)
-    for k in range(N):
-        writer.add(CloudFrame(k, k / 10, points))
-    writer.finish()
+    record(tmp_path / "clouds", [CloudFrame(k, k / 10, points) for k in range(N)])
     again = copied(session_results["there"], tmp_path)
     run = json.loads((again / "run.json").read_text())
-    run["input"]["opening"]["paths"] = [str(tmp_path / "clouds")]
     frames = [frame | {"mean_depth_m": None} for frame in run["frames"]]
-    change_run(again, input=run["input"], frames=frames)
+    read_from(again, tmp_path / "clouds", frames=frames)
     refused([session_results["here"], again], "clouds", "pass their clouds together")
 
 

@@ -174,9 +174,7 @@ def test_interrupted_run_gives_same_bytes(room_recording: Path, tmp_path: Path, 
 
 
 @pytest.mark.parametrize("change", ["options", "input", "damage"])
-def test_other_or_damaged_file_is_not_used(
-    change: str, room_recording: Path, tmp_path: Path, capfd
-) -> None:
+def test_other_or_damaged_file_is_not_used(change, room_recording, tmp_path, capfd) -> None:
     out = tmp_path / "out"
     words = ["run", str(room_recording), "--every", "4", "--method", "thesis", "--out", str(out)]
     assert interrupted_at("fusing", KeyboardInterrupt(), words) == 130

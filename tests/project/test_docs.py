@@ -85,9 +85,7 @@ def examples() -> list[Any]:
 
 
 @pytest.mark.parametrize("name", examples())
-def test_python_in_documents_runs(
-    name: str, short_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_python_in_documents_runs(name, short_recording, tmp_path, monkeypatch) -> None:
     shutil.copytree(short_recording, tmp_path / "recording")
     monkeypatch.chdir(tmp_path)
     reference.kinds()  # imported now, so that only parts of the document are removed afterwards
@@ -330,9 +328,7 @@ def simulate_less(monkeypatch: pytest.MonkeyPatch, *effects: str, frames: int) -
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("path", sorted({*NOTEBOOKS} - {JUDGING}), ids=lambda path: path.stem)
-def test_notebooks_run(
-    path: Path, short_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_notebooks_run(path: Path, short_recording: Path, tmp_path: Path, monkeypatch) -> None:
     shutil.copytree(short_recording, tmp_path / "scan")
     monkeypatch.chdir(tmp_path)
     simulate_less(monkeypatch, "all", frames=3)
@@ -340,9 +336,7 @@ def test_notebooks_run(
 
 
 @pytest.mark.nightly
-def test_phone_notebook_runs_on_phone_scan(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shared_data: Path
-) -> None:
+def test_phone_notebook_runs_on_phone_scan(tmp_path: Path, monkeypatch, shared_data: Path) -> None:
     scan = shared_data / "iphone_record3d"
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TOFUSE_SCAN", str(scan))

@@ -9,6 +9,7 @@ from typing import Annotated, ClassVar, Literal, Protocol
 
 import pytest
 
+from refused import refused
 from tofuse.engine import parts
 from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
 from tofuse.engine.errors import InputError
@@ -149,8 +150,7 @@ class _Limits(Bounded):
 def test_values_outside_declared_bounds_are_refused(wrong, message) -> None:
     with pytest.raises(ValueError, match=f"^{message}$"):
         _Limits(**wrong)
-    with pytest.raises(InputError, match=message):
-        parts.from_dict(_Limits, wrong, where="test.toml")
+    refused(message, _Limits, wrong, by=parts.from_dict, where="test.toml")
 
 
 def installed(folder, module: str, text: str) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 import made_arrays as made
 import tofuse
+from refused import refused
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
@@ -21,7 +22,6 @@ def test_npz_round_trip(tmp_path: Path) -> None:
     given = made.arrays()
     np.savez_compressed(tmp_path / "a.npz", **given)
     recording = open_recording(tmp_path / "a.npz")
-    assert (recording.format, len(recording)) == ("npz", 3)
     np.testing.assert_array_equal(recording.timestamps, given["timestamps"])
     assert recording.odometry is not None
     np.testing.assert_allclose(recording.reference, made.POSES, atol=1e-12)
@@ -33,12 +33,9 @@ def test_npz_round_trip(tmp_path: Path) -> None:
         assert frame.depth_kind == "range"
         truth = np.where(made.COUNTS[k] == 65535, 0, made.COUNTS[k]) * 0.001
         np.testing.assert_allclose(frame.radial_range, truth, rtol=1e-6)
-        np.testing.assert_array_equal(frame.amplitude_image, given["amplitude"][k])
-        np.testing.assert_array_equal(frame.confidence_image, given["confidence"][k])
-        np.testing.assert_array_equal(frame.color_image, given["color"][k])
-        np.testing.assert_allclose(frame.sigma_image, given["sigma"][k], rtol=1e-6)
+        for name in ("amplitude", "confidence", "color", "sigma"):
+            np.testing.assert_allclose(getattr(frame, f"{name}_image"), given[name][k], rtol=1e-6)
         assert frame.ambiguity_m == 7.5
-    assert recording.warnings == []
 
 
 def test_npz_with_metres_and_rays(tmp_path: Path) -> None:
@@ -74,39 +71,28 @@ def test_npz_with_metres_and_rays(tmp_path: Path) -> None:
         ({"rays": np.zeros((3, 3, 2))}, "rays: has shape"),
         ({"distortion": np.zeros(6), "model": "brown"}, "distortion: has 6 numbers"),
         ({"confidence_max": -1}, "confidence_max: isn't a positive number"),
+        ({"depth": -0.001 * made.COUNTS}, "holds negative depth only; negate it"),
     ],
 )
 def test_npz_errors_name_the_problem(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     np.savez(tmp_path / "a.npz", **made.arrays(**changes))
-    with pytest.raises(InputError, match=message):
-        open_recording(tmp_path / "a.npz")
-
-
-def test_negative_depth_of_a_file_is_named(tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", **made.arrays(depth=-0.001 * made.COUNTS))
-    with pytest.raises(InputError, match="holds negative depth only; negate it"):
-        open_recording(tmp_path / "a.npz")
+    refused(message, tmp_path / "a.npz")
 
 
 def test_npy_alone_says_what_it_lacks(tmp_path: Path) -> None:
     np.save(tmp_path / "depth.npy", made.COUNTS)
     for path in (tmp_path, tmp_path / "depth.npy"):
-        with pytest.raises(InputError, match=r"depth and K by numpy\.savez"):
-            open_recording(path)
+        refused(r"depth and K by numpy\.savez", path)
 
 
 def test_zense(tmp_path: Path) -> None:
     made.make_zense(tmp_path / "scan")
-    recording = open_recording(tmp_path / "scan")
-    assert (recording.format, len(recording)) == ("zense", 3)
-    np.testing.assert_allclose(recording.timestamps, np.arange(3) / 15)
-    frame = recording[1]
+    frame = open_recording(tmp_path / "scan")[1]
     assert frame.camera == Pinhole(16, 12, 20.0, 21.0, 7.5, 5.5)
     np.testing.assert_allclose(frame.z[1:], made.COUNTS[1, 1:] * 0.001, rtol=1e-6)
     path = tmp_path / "scan" / "camera.toml"
     path.write_text(path.read_text().replace("camera_cy = 5.5", ""))
-    with pytest.raises(InputError, match=r"camera\.toml: camera_cy: is missing; use a number"):
-        open_recording(tmp_path / "scan")
+    refused(r"camera\.toml: camera_cy: is missing; use a number", tmp_path / "scan")
 
 
 def test_real_zense(shared_data: Path) -> None:
@@ -161,5 +147,4 @@ def test_arrays_that_hold_no_depth_in_mm_or_are_elsewhere() -> None:
         def __iter__(self):
             raise TypeError("can't convert cuda:0 device type tensor to numpy: use Tensor.cpu()")
 
-    with pytest.raises(InputError, match=r"not an array of images .*use Tensor\.cpu\(\)"):
-        tofuse.from_arrays(Tensor(), K)
+    refused(r"not an array of images .*use Tensor\.cpu\(\)", Tensor(), K, by=tofuse.from_arrays)

@@ -16,25 +16,19 @@ from phone_checks import check_frames, check_lens
 from posed_results import BROWN, made_result
 from posed_results import POSED as EXPORTED
 from posed_results import POSES as EXPORTED_POSES
+from refused import refused
 from tofuse.apps.export.exporting import export
 from tofuse.engine.cameras.cameras import BrownConrady, Fisheye, Pinhole
-from tofuse.engine.errors import InputError, UnreadableFrameError
+from tofuse.engine.errors import UnreadableFrameError
 from tofuse.formats.images.images import parse_image
 from tofuse.formats.recordings.open import open_recording
 
 
-def test_polycam(tmp_path: Path) -> None:
+def test_folder_of_keyframes_is_a_polycam_export(tmp_path: Path) -> None:
     made.make_polycam(tmp_path / "scan")
-    for path in (tmp_path / "scan", tmp_path / "scan" / "keyframes"):
-        recording = open_recording(path)
-        assert recording.format == "polycam"
-        np.testing.assert_allclose(recording.timestamps, [5.0, 5.25, 5.5])
-        check_frames(recording)
-        assert recording.metadata["poses_by"] == "Polycam"
-        for k, frame in enumerate(recording):
-            check_lens(frame, made_phones.FX + k, made_phones.CX, made_phones.CY)
-            assert frame.color_image is not None
-        assert recording.warnings == []
+    recording = open_recording(tmp_path / "scan" / "keyframes")
+    assert recording.metadata["poses_by"] == "Polycam"
+    check_frames(recording)
 
 
 def test_polycam_with_corrected_cameras_and_images_alone(tmp_path: Path) -> None:
@@ -43,7 +37,6 @@ def test_polycam_with_corrected_cameras_and_images_alone(tmp_path: Path) -> None
     shutil.rmtree(folder / "keyframes" / "cameras")
     (folder / "keyframes" / "images").rename(folder / "keyframes" / "corrected_images")
     recording = open_recording(folder)
-    assert recording.format == "polycam"
     check_frames(recording)
     for k, frame in enumerate(recording):
         check_lens(frame, made_phones.FX + k, made_phones.CX, made_phones.CY)
@@ -64,7 +57,13 @@ def test_poses_of_a_phone_are_told_from_those_of_a_program(tmp_path: Path) -> No
     made.make_nerfcapture(tmp_path / "phone")
     made.make_nerfstudio(tmp_path / "program")
     assert open_recording(tmp_path / "phone").metadata["poses_by"] == "NeRFCapture"
-    assert "poses_by" not in open_recording(tmp_path / "program").metadata
+    recording = open_recording(tmp_path / "program")
+    assert "poses_by" not in recording.metadata
+    check_frames(recording)
+    # Eight colour pixels are one depth pixel; both grids start at a corner.
+    center = (130 / 8 - 0.5, 95 / 8 - 0.5)
+    expected = BrownConrady(WIDTH, HEIGHT, 25.0, 201 / 8, *center, -0.05, 0.01, 0.001)
+    np.testing.assert_allclose(recording[0].camera.rays(), expected.rays(), atol=1e-6)
 
 
 def test_nerfstudio_with_views_for_training_alone(tmp_path: Path) -> None:
@@ -79,20 +78,6 @@ def test_nerfstudio_with_views_for_training_alone(tmp_path: Path) -> None:
     (note,) = (w for w in open_recording(tmp_path / "scan").warnings if "the only frames" in w)
     assert "transforms_test.json" in note
     assert len(open_recording(file, test)) == 2 * len(open_recording(test))
-
-
-def test_nerfstudio(tmp_path: Path) -> None:
-    made.make_nerfstudio(tmp_path / "scan")
-    for path in (tmp_path / "scan", tmp_path / "scan" / "transforms.json"):
-        recording = open_recording(path)
-        assert recording.format == "nerfstudio"
-        check_frames(recording)
-    frame = recording[0]
-    # Eight colour pixels are one depth pixel; both grids start at a corner.
-    expected = BrownConrady(
-        WIDTH, HEIGHT, 25.0, 201 / 8, 130 / 8 - 0.5, 95 / 8 - 0.5, -0.05, 0.01, 0.001
-    )
-    np.testing.assert_allclose(frame.camera.rays(), expected.rays(), atol=1e-6)
 
 
 def test_exported_nerfstudio_is_read_back(tmp_path: Path) -> None:
@@ -112,13 +97,10 @@ def test_exported_nerfstudio_is_read_back(tmp_path: Path) -> None:
 
 
 def changed(folder: Path, **changes: object) -> None:
+    """Change fields of a transforms.json; None removes one."""
     path = folder / "transforms.json"
-    about = json.loads(path.read_text())
-    for name, value in changes.items():
-        about.pop(name, None)
-        if value is not None:
-            about[name] = value
-    path.write_text(json.dumps(about))
+    about = json.loads(path.read_text()) | changes
+    path.write_text(json.dumps({k: v for k, v in about.items() if v is not None}))
 
 
 def test_nerfstudio_with_angle_fisheye_and_float_depth(tmp_path: Path) -> None:
@@ -156,8 +138,6 @@ def test_nerfstudio_with_angle_fisheye_and_float_depth(tmp_path: Path) -> None:
 def test_hololens(tmp_path: Path, stream: str, unpacked: bool) -> None:
     made.make_hololens(tmp_path / "scan", stream=stream, unpacked=unpacked)
     recording = open_recording(tmp_path / "scan")
-    assert recording.format == "hololens2"
-    np.testing.assert_allclose(np.diff(recording.timestamps), 0.2, atol=1e-5)
     np.testing.assert_allclose(recording.reference, POSES, atol=1e-9)
     rays = made.hololens_rays()
     for k, frame in enumerate(recording):
@@ -168,9 +148,8 @@ def test_hololens(tmp_path: Path, stream: str, unpacked: bool) -> None:
         assert frame.valid[3:].all()
         np.testing.assert_array_equal(frame.amplitude_image, made.AMPLITUDE[k])
         assert frame.ambiguity_m == (1.0 if stream == "Depth AHaT" else None)
-    points = frame.points
-    np.testing.assert_allclose(np.linalg.norm(points, axis=1), frame.depth[frame.valid], rtol=1e-5)
-    assert recording.warnings == []
+    lengths = np.linalg.norm(frame.points, axis=1)
+    np.testing.assert_allclose(lengths, frame.depth[frame.valid], rtol=1e-5)
 
 
 def test_incomplete_hololens(tmp_path: Path) -> None:
@@ -197,8 +176,7 @@ def test_incomplete_hololens(tmp_path: Path) -> None:
     assert any("extrinsics.txt is missing" in line for line in recording.warnings)
     table = folder / f"{stream}_lut.bin"
     table.write_bytes(table.read_bytes()[:-12])
-    with pytest.raises(InputError, match="not 12 for each of"):
-        open_recording(folder)
+    refused("not 12 for each of", folder)
 
 
 def test_pgm() -> None:
@@ -207,8 +185,7 @@ def test_pgm() -> None:
     small = b"P5 # made by hand\n3 2\n# twice\n255\n" + bytes(range(6))
     np.testing.assert_array_equal(parse_image(small, "a.pgm"), np.arange(6).reshape(2, 3))
     for bad in (b"", b"P2\n1 1\n1\n1", b"P5\n0 2\n255\n", b"P5\n99999 99999\n255\n", small[:-1]):
-        with pytest.raises(InputError, match=r"a\.pgm"):
-            parse_image(bad, "a.pgm")
+        refused(r"a\.pgm", bad, "a.pgm", by=parse_image)
 
 
 @pytest.mark.parametrize(
@@ -217,27 +194,19 @@ def test_pgm() -> None:
 )
 def test_kinect2(tmp_path: Path, size: tuple[int, int], serial: str, scale: float) -> None:
     made.make_kinect2(tmp_path / "scan", size=size, serial=serial)
-    recording = open_recording(tmp_path / "scan")
-    assert (recording.format, len(recording)) == ("kinect2", 3)
-    for k, frame in enumerate(recording):
-        fx, fy, cx, cy = (scale * value for value in made.K2)
-        assert frame.camera == Pinhole(*size, fx, fy, cx, cy)
+    for k, frame in enumerate(open_recording(tmp_path / "scan")):
+        assert frame.camera == Pinhole(*size, *(scale * value for value in made.K2))
         assert frame.depth[100, 100] == pytest.approx(1 + 0.1 * k)
         assert not frame.valid[0, 0]
         assert (frame.color_image is None) == (k == 1)
-    assert "only 2 of 3 frames have colour" in recording.warnings
 
 
-def test_depth16(tmp_path: Path) -> None:
+def test_depth16_level_of_confidence(tmp_path: Path) -> None:
+    """Level 0 is undefined and counts as certain; level n is (n - 1) sevenths."""
     made.make_depth16(tmp_path / "scan")
     recording = open_recording(tmp_path / "scan")
-    assert recording.format == "depth16"
-    np.testing.assert_allclose(recording.timestamps, [0, 0.1, 0.2])
     assert recording.metadata["confidence_max"] == 7
     for k, frame in enumerate(recording):
         np.testing.assert_allclose(frame.depth, DEPTH[k], atol=6e-4)
-        # Level 0 is undefined and counts as certain; level n is (n - 1) sevenths.
         expected = np.array([7, 4, 5], np.uint8)[made_phones.CONFIDENCE[k]]
         np.testing.assert_array_equal(frame.confidence_image, expected)
-        assert (frame.color_image is not None) == (k == 1)
-    assert recording.warnings == ["only 1 of 3 frames have colour"]

@@ -7,12 +7,14 @@ import shutil
 import struct
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from refused import refused
 from ros_bags import (
     COLOR_LENS,
     COLOR_U,
@@ -40,6 +42,7 @@ from tofuse.formats.readers.maker_bags import RealSenseSource
 from tofuse.formats.recordings.open import open_recording
 
 KINDS = ("ros1", "ros2", "mcap")
+UNKNOWN = SimpleNamespace(width=16, height=12, fx=0, fy=0, cx=0, cy=0)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -52,7 +55,6 @@ def test_depth_images(tmp_path: Path, kind: str) -> None:
         bag.image("/camera/color/depth_like", 10 + k / 10, color, "16UC1")
         bag.image(TOPIC, 10 + k / 10, COUNTS[k], "16UC1", pad=6)
     recording = open_recording(bag.close())
-    assert (recording.format, len(recording)) == ("ros", 3)
     np.testing.assert_allclose(recording.timestamps, [10, 10.1, 10.2], atol=1e-6)
     assert recording.metadata["topic"] == TOPIC
     assert any("/camera/color/depth_like" in line for line in recording.warnings)
@@ -94,9 +96,7 @@ def test_lens_of_rectified_images(tmp_path: Path, topic: str, rectified: bool) -
         ("/depth_image", "/depth_camera_info", "/color_camera_info"),
     ],
 )
-def test_lens_is_that_of_the_topic_of_like_name(
-    tmp_path: Path, topic: str, own: str, other: str
-) -> None:
+def test_lens_is_that_of_the_topic_of_like_name(tmp_path, topic, own, other) -> None:
     bag = Bag(tmp_path, "mcap")
     bag.info(other, D=(), lens=Pinhole(16, 12, 30.0, 30.0, 8.0, 6.0))
     bag.info(own, D=())
@@ -120,8 +120,7 @@ def test_lens_of_binned_part_of_images(tmp_path: Path, kind: str) -> None:
 
 def test_depth_of_depthai(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "mcap")
-    bag.info("/oak/stereo/camera_info")
-    bag.image("/oak/stereo/image_raw", 10, COUNTS[0], "16UC1")
+    bag.depth("/oak/stereo/image_raw")
     frame = open_recording(bag.close())[0]
     np.testing.assert_allclose(frame.z, COUNTS[0] / 1000, rtol=1e-6)
 
@@ -131,8 +130,7 @@ def test_file_of_bag_alone_in_a_folder(tmp_path: Path, kind: str) -> None:
     """Copied without the metadata.yaml of ROS 2, or into a folder with notes."""
     (tmp_path / "bag").mkdir()
     bag = Bag(tmp_path / "bag", kind)
-    bag.info("/a/depth/camera_info")
-    bag.image(TOPIC, 10, COUNTS[0], "16UC1")
+    bag.depth()
     bag.close()
     (file,) = (p for p in (tmp_path / "bag").rglob("a.*") if p.suffix in (".bag", ".db3", ".mcap"))
     (tmp_path / "copy").mkdir()
@@ -140,11 +138,9 @@ def test_file_of_bag_alone_in_a_folder(tmp_path: Path, kind: str) -> None:
     shutil.copy(file, tmp_path / "copy")
     assert len(open_recording(tmp_path / "copy")) == 1
     shutil.copy(file, tmp_path / "copy" / f"b{file.suffix}")
-    with pytest.raises(InputError, match=r"several recordings: a\.\w+ \(ros\), b\.\w+ \(ros\)"):
-        open_recording(tmp_path / "copy")
+    refused(r"several recordings: a\.\w+ \(ros\), b\.\w+ \(ros\)", tmp_path / "copy")
     file.write_bytes(b"")
-    with pytest.raises(InputError, match=r"a\.\w+: is empty"):
-        open_recording(file)
+    refused(r"a\.\w+: is empty", file)
 
 
 def test_mcap_of_another_program_is_refused_by_its_profile(tmp_path: Path) -> None:
@@ -152,26 +148,20 @@ def test_mcap_of_another_program_is_refused_by_its_profile(tmp_path: Path) -> No
     header = struct.pack("<I", len(profile)) + profile + struct.pack("<I", 0)
     record = b"\x01" + struct.pack("<Q", len(header)) + header
     (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + record + bytes(100))
-    with pytest.raises(InputError, match=r"no messages of ROS 2 \(its profile is 'protobuf'\)"):
-        open_recording(tmp_path / "a.mcap")
+    refused(r"no messages of ROS 2 \(its profile is 'protobuf'\)", tmp_path / "a.mcap")
 
 
-def test_compressed_depth(tmp_path: Path) -> None:
-    bag = Bag(tmp_path, "ros2")
+@pytest.mark.parametrize(("kind", "encoding", "a"), [("ros2", "16UC1", 0), ("ros1", "32FC1", 4e3)])
+def test_compressed_depth(tmp_path: Path, kind: str, encoding: str, a: float) -> None:
+    """Floats are stored as a / depth + b."""
+    bag = Bag(tmp_path, kind)
     bag.info("/a/depth/camera_info")
+    data = struct.pack("<Iff", 0, a, -10.0 if a else 0) + png_bytes(COUNTS[0])
     topic = "/a/depth/image_rect/compressedDepth"
-    head = struct.pack("<Iff", 0, 0, 0)
-    bag.compressed(topic, 10, head + png_bytes(COUNTS[0]), "16UC1; compressedDepth png")
+    bag.compressed(topic, 10, data, f"{encoding}; compressedDepth png")
     frame = open_recording(bag.close())[0]
-    np.testing.assert_allclose(frame.z, COUNTS[0] / 1000, rtol=1e-6)
-    # Floats are stored as a / depth + b.
-    a, b = 4000.0, -10.0
-    second = Bag(tmp_path / "second", "ros1") if (tmp_path / "second").mkdir() is None else None
-    second.info("/a/depth/camera_info")
-    data = struct.pack("<Iff", 0, a, b) + png_bytes(COUNTS[1])
-    second.compressed(topic, 10, data, "32FC1; compressedDepth png")
-    frame = open_recording(second.close())[0]
-    np.testing.assert_allclose(frame.z, a / (COUNTS[1] - b), rtol=1e-5)
+    expected = a / (COUNTS[0] + 10.0) if a else COUNTS[0] / 1000
+    np.testing.assert_allclose(frame.z, expected, rtol=1e-5)
 
 
 def test_depth_compressed_as_any_image(tmp_path: Path) -> None:
@@ -190,9 +180,8 @@ def test_depth_compressed_as_any_image(tmp_path: Path) -> None:
 def test_lens_and_size_once_the_driver_has_settled(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "mcap")
     topic = f"{TOPIC.rpartition('/')[0]}/camera_info"
-    unknown = SimpleNamespace(width=16, height=12, fx=0, fy=0, cx=0, cy=0)
     coarse = Pinhole(8, 6, 10.0, 10.5, 3.5, 2.5)
-    for lens in (unknown, coarse, DEPTH_LENS):
+    for lens in (UNKNOWN, coarse, DEPTH_LENS):
         bag.info(topic, D=(), lens=lens)
     for k in range(4):
         counts = COUNTS[0][::2, ::2] if k == 0 else COUNTS[0]
@@ -202,18 +191,17 @@ def test_lens_and_size_once_the_driver_has_settled(tmp_path: Path) -> None:
 
 
 def test_lens_of_another_namespace_by_frame_and_size(tmp_path: Path) -> None:
-    bag = Bag(tmp_path, "ros1")
-    for topic, lens in (("/a/info", COLOR_LENS), ("/b/info", DEPTH_LENS)):
-        bag.info(topic, D=(), lens=lens)
-    bag.image("/driver/tof/depth", 10, COUNTS[0], "16UC1")
-    assert open_recording(bag.close())[0].camera == DEPTH_LENS
-    (tmp_path / "b").mkdir()
-    bag = Bag(tmp_path / "b", "ros1")
-    for topic in ("/a/info", "/b/info"):
-        bag.info(topic, D=(), lens=COLOR_LENS)
-    bag.image("/driver/tof/depth", 10, COUNTS[0], "16UC1")
-    with pytest.raises(InputError, match=r"no CameraInfo for .*, but for others \(/a/info, /b/i"):
-        open_recording(bag.close())
+    for name, second in (("a", DEPTH_LENS), ("b", COLOR_LENS)):
+        (tmp_path / name).mkdir()
+        bag = Bag(tmp_path / name, "ros1")
+        bag.info("/a/info", D=(), lens=COLOR_LENS)
+        bag.info("/b/info", D=(), lens=second)
+        bag.image("/driver/tof/depth", 10, COUNTS[0], "16UC1")
+        path = bag.close()
+        if second is DEPTH_LENS:
+            assert open_recording(path)[0].camera == DEPTH_LENS
+        else:
+            refused(r"no CameraInfo for .*, but for others \(/a/info, /b/i", path)
 
 
 def test_clouds(tmp_path: Path) -> None:
@@ -277,9 +265,7 @@ def test_infrared_of_same_pixels_is_the_amplitude(tmp_path: Path) -> None:
 def test_driver_restarted_during_recording(tmp_path: Path) -> None:
     """A ROS 1 bag has one connection per publisher of a topic."""
     bag = Bag(tmp_path, "ros1")
-    bag.info("/camera/depth/camera_info")
-    bag.image(TOPIC, 10.0, COUNTS[0], "16UC1")
-    bag.image(TOPIC, 10.1, COUNTS[1], "16UC1")
+    bag.depth(count=2)
     bag.connections[TOPIC] = bag.writer.add_connection(
         TOPIC, "sensor_msgs/msg/Image", typestore=bag.store, callerid="/restarted"
     )
@@ -309,17 +295,14 @@ def test_amplitude_and_colour_are_of_the_same_camera(tmp_path: Path) -> None:
 
 def test_topic_can_be_chosen(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "mcap")
-    bag.info("/a/depth/camera_info")
-    bag.info("/b/depth/camera_info")
-    bag.image("/a/depth/image_raw", 10, COUNTS[0], "16UC1")
-    bag.image("/b/depth/image_raw", 10, COUNTS[1], "16UC1")
+    bag.depth("/a/depth/image_raw")
+    bag.depth("/b/depth/image_raw", count=2)
     path = bag.close()
     assert open_recording(path).metadata["topic"] == "/a/depth/image_raw"
     recording = open_recording(path, topic="/b/depth/image_raw")
     assert recording.warnings == []
-    np.testing.assert_allclose(recording[0].z, COUNTS[1] / 1000, rtol=1e-6)
-    with pytest.raises(InputError, match=r"has no images or clouds at /c .*/a/depth/image_raw"):
-        open_recording(path, topic="/c")
+    np.testing.assert_allclose(recording[1].z, COUNTS[1] / 1000, rtol=1e-6)
+    refused(r"has no images or clouds at /c .*/a/depth/image_raw", path, topic="/c")
 
 
 def expected_colors(z: np.ndarray, T: np.ndarray, lens: Pinhole = COLOR_LENS) -> np.ndarray:
@@ -373,8 +356,7 @@ def test_realsense_stereo_and_lenses(tmp_path: Path) -> None:
     u, v = brown.project(straight)
     expected = ((u - 7.5) / 20, (v - 5.5) / 21)
     np.testing.assert_allclose(frame.camera.rays()[9, 3], expected, atol=1e-6)
-    with pytest.raises(InputError, match=r"^topic: does not apply"):
-        open_recording(path, topic="/device_0/sensor_0/Depth_0/image/data")
+    refused(r"^topic: does not apply", path, topic="/device_0/sensor_0/Depth_0/image/data")
 
 
 @pytest.mark.parametrize(("kind", "encoding", "off"), [
@@ -427,29 +409,21 @@ def test_orbbec_bags(tmp_path: Path) -> None:
         np.testing.assert_array_equal(frame.amplitude_image, COUNTS[index] // 2)
 
 
-def test_missing_topics_are_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("topic", "lens", "says"),
+    [
+        (TOPIC, None, r"has no CameraInfo for .*; pass .* with camera=camera\.json"),
+        (TOPIC, UNKNOWN, r"not calibrated \(K is zero\); pass .* with camera=camera\.json"),
+        ("/rgb/image", None, r"no topic of depth images or clouds .*/rgb/image"),
+    ],
+    ids=["lens", "calibration", "depth"],
+)
+def test_what_is_missing_is_named(tmp_path, topic, lens, says) -> None:
     bag = Bag(tmp_path, "ros1")
-    bag.image(TOPIC, 10, COUNTS[0], "16UC1")
-    with pytest.raises(
-        InputError, match=r"has no CameraInfo for .*; pass .* with camera=camera\.json"
-    ):
-        open_recording(bag.close())
-    (tmp_path / "k").mkdir()
-    bag = Bag(tmp_path / "k", "ros1")
-    bag.image(TOPIC, 10, COUNTS[0], "16UC1")
-    unknown = SimpleNamespace(width=64, height=48, fx=0, fy=0, cx=0, cy=0)
-    bag.info(f"{TOPIC.rpartition('/')[0]}/camera_info", D=(), lens=unknown)
-    with pytest.raises(
-        InputError, match=r"not calibrated \(K is zero\); pass .* with camera=camera\.json"
-    ):
-        open_recording(bag.close())
-    (tmp_path / "b").mkdir()
-    bag = Bag(tmp_path / "b", "ros1")
-    bag.image("/camera/color/image", 10, COUNTS[0], "mono16")
-    with pytest.raises(
-        InputError, match=r"no topic of depth images or clouds .*/camera/color/image"
-    ):
-        open_recording(bag.close())
+    bag.image(topic, 10, COUNTS[0], "16UC1" if topic == TOPIC else "mono16")
+    if lens is not None:
+        bag.info(f"{topic.rpartition('/')[0]}/camera_info", lens=lens)
+    refused(says, bag.close())
 
 
 @pytest.mark.parametrize(
@@ -457,14 +431,12 @@ def test_missing_topics_are_named(tmp_path: Path) -> None:
     [("ros1", "BZ2"), ("ros1", "LZ4"), ("mcap", "STORAGE"), ("mcap", "MESSAGE"),
      ("ros2", "MESSAGE"), ("ros2", "FILE"), ("mcap", "FILE")],
 )  # fmt: skip
-def test_compressed_bags(
-    tmp_path: Path, kind: str, packed: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_compressed_bags(tmp_path: Path, kind: str, packed: str, monkeypatch) -> None:
     """Compressed files are decompressed into a temporary folder, which is removed."""
     (temporary := tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     bag = Bag(tmp_path, kind, packed)
-    depth_bag(bag)
+    bag.depth(count=3)
     recording = open_recording(bag.close())
     np.testing.assert_allclose(recording[2].z, COUNTS[2] / 1000, rtol=1e-6)
     del recording
@@ -472,14 +444,11 @@ def test_compressed_bags(
     assert list(temporary.iterdir()) == []
 
 
-def test_missing_rosbags_is_reported_with_remedy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_rosbags_is_reported_with_remedy(tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(4096))
 
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    with pytest.raises(InputError, match=r"needs the package rosbags.*pip install 'tofuse\[ros\]'"):
-        open_recording(tmp_path / "a.bag")
+    refused(r"needs the package rosbags.*pip install 'tofuse\[ros\]'", tmp_path / "a.bag")
 
 
 COLOR_TOPIC = "/camera/color/image_raw"
@@ -488,12 +457,6 @@ T_RIG_DEPTH, T_RIG_COLOR = exp(
     np.array([[0.1, 0.2, 0.3, 0.1, 0.2, 0.3], [0.12, 0.2, 0.3, 0, 0, 0]])
 )
 T_WORLD_RIG = exp(np.random.default_rng(101).normal(size=(3, 6)) * 0.1)
-
-
-def depth_bag(bag: Bag) -> None:
-    bag.info("/camera/depth/camera_info", D=())
-    for k in range(3):
-        bag.image(TOPIC, 10 + 0.1 * k, COUNTS[k], "16UC1")
 
 
 def color_at(k: int) -> np.ndarray:
@@ -506,7 +469,7 @@ def color_at(k: int) -> np.ndarray:
 def test_colour_of_separate_camera(tmp_path: Path, kind: str, compressed: bool) -> None:
     """Posed by tf_static, over intermediate frames; each point has the colour at its projection."""
     bag = Bag(tmp_path, kind)
-    depth_bag(bag)
+    bag.depth(count=3)
     bag.info("/camera/color/camera_info", D=(), lens=RGB_LENS)
     bag.tf("/tf_static", 9.0, "rig", "middle", T_RIG_DEPTH)
     bag.tf("/tf_static", 9.0, "middle", "depth", np.eye(4))
@@ -538,8 +501,7 @@ def test_colour_of_separate_camera(tmp_path: Path, kind: str, compressed: bool) 
 
 def test_colour_that_the_azure_kinect_driver_registers(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "ros1")
-    bag.info("/depth/camera_info", D=())
-    bag.image("/depth/image_raw", 10.0, COUNTS[0], "16UC1")
+    bag.depth("/depth/image_raw")
     image = np.dstack([color_at(0)[:12, :16, ::-1], np.full((12, 16), 255, np.uint8)])
     bag.image("/rgb_to_depth/image_raw", 10.0, image, "bgra8", width=16)
     frame = open_recording(bag.close())[0]
@@ -561,7 +523,7 @@ def test_no_image_is_the_colour_of_two_frames(tmp_path: Path) -> None:
 def test_static_transforms_of_early_publishers(tmp_path: Path) -> None:
     """They repeat them on /tf, which makes neither poses nor a camera that moves."""
     bag = Bag(tmp_path, "ros1")
-    depth_bag(bag)
+    bag.depth(count=3)
     bag.info("/camera/color/camera_info", D=(), lens=RGB_LENS)
     for time in (9.0, 9.1, 10.1):
         bag.tf("/tf", time, "rig", "depth", T_RIG_DEPTH)
@@ -574,28 +536,55 @@ def test_static_transforms_of_early_publishers(tmp_path: Path) -> None:
 
 def test_colour_registered_to_depth(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "ros2")
-    topic = "/camera/aligned_depth_to_color/image_raw"
-    bag.info("/camera/aligned_depth_to_color/camera_info", D=())
-    bag.image(topic, 10.0, COUNTS[0], "16UC1")
+    bag.depth("/camera/aligned_depth_to_color/image_raw")
     image = np.ascontiguousarray(color_at(0)[:12, :16])
     bag.image(COLOR_TOPIC, 10.0, image, "rgb8", frame="color", width=16)
     np.testing.assert_array_equal(open_recording(bag.close())[0].color_image, image)
 
 
-def test_colour_without_pose_is_ignored(tmp_path: Path) -> None:
-    bag = Bag(tmp_path, "ros2")
-    depth_bag(bag)
-    bag.image(COLOR_TOPIC, 10.0, color_at(0), "rgb8", frame="color", width=32)
+Add = Callable[[Bag, float, np.ndarray], None]
+UNRELATED: dict[str, tuple[Add, str]] = {
+    "colour": (
+        lambda bag, time, _: bag.image(COLOR_TOPIC, time, color_at(0), "rgb8", 0, 32, "color"),
+        f"colour is ignored: the relation of {COLOR_TOPIC}",
+    ),
+    "odometry": (
+        lambda bag, time, T: bag.odometry("/odom", time, "odom", "base", T),
+        "odometry has frames that move",
+    ),
+    "gravity": (
+        lambda bag, time, _: bag.imu("/imu", time, "elsewhere", np.array([0.0, 0.0, 9.8])),
+        "gravity in /imu is ignored: the relation",
+    ),
+    "another clock": (
+        lambda bag, time, T: bag.tf("/tf", 1e9 + time, "odom", "depth", T),
+        "moves, but at no time of an image",
+    ),
+    # The robot moves, and nothing says where the camera is.
+    "no latched tf": (
+        lambda bag, time, T: bag.tf("/tf", time, "odom", "base_link", T),
+        "/tf_static was not recorded",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", UNRELATED)
+def test_what_nothing_relates_to_depth_is_named_and_ignored(tmp_path: Path, what: str) -> None:
+    add, says = UNRELATED[what]
+    bag = Bag(tmp_path, "mcap")
+    bag.depth(count=3)
+    for k, T in enumerate(T_WORLD_RIG):
+        add(bag, 10 + 0.1 * k, T)
     recording = open_recording(bag.close())
-    assert recording[0].color_image is None
-    assert any(f"colour is ignored: the relation of {COLOR_TOPIC}" in w for w in recording.warnings)
+    assert any(says in line for line in recording.warnings)
+    assert recording.odometry is recording.gravity is recording[0].color_image is None
 
 
 @pytest.mark.parametrize("kind", ["ros1", "ros2"])  # names with and without a slash
 def test_poses_from_tf(tmp_path: Path, kind: str) -> None:
     """Odometry below a map that corrects it; poses are interpolated between messages."""
     bag = Bag(tmp_path, kind)
-    depth_bag(bag)
+    bag.depth(count=3)
     slash = "/" if kind == "ros1" else ""
     bag.tf("/tf_static", 9.0, f"{slash}base_link", f"{slash}depth", T_RIG_DEPTH)
     T_MAP_ODOM = exp(np.array([1.0, 2.0, 0.5, 0.0, 0.0, 0.4]))
@@ -619,7 +608,7 @@ def test_poses_from_tf(tmp_path: Path, kind: str) -> None:
 def test_poses_of_odometry_messages(tmp_path: Path, kind: str) -> None:
     """Of a frame that tf attaches below the root of the camera's tree."""
     bag = Bag(tmp_path, kind)
-    depth_bag(bag)
+    bag.depth(count=3)
     T_BASE_IMU = exp(np.array([0.3, 0.0, 0.1, 0.0, 0.0, 1.0]))
     bag.tf("/tf_static", 9.0, "base", "depth", T_RIG_DEPTH)
     bag.tf("/tf_static", 9.0, "base", "imu", T_BASE_IMU)
@@ -634,7 +623,7 @@ def test_poses_of_odometry_messages(tmp_path: Path, kind: str) -> None:
 
 def test_tf_precedes_odometry_messages(tmp_path: Path) -> None:
     bag = Bag(tmp_path, "mcap")
-    depth_bag(bag)
+    bag.depth(count=3)
     bag.tf("/tf_static", 9.0, "base", "depth", T_RIG_DEPTH)
     for k, T in enumerate(T_WORLD_RIG):
         bag.tf("/tf", 10 + 0.1 * k, "odom", "base", T)
@@ -644,21 +633,11 @@ def test_tf_precedes_odometry_messages(tmp_path: Path) -> None:
     assert "odometry_topic" not in recording.metadata
 
 
-def test_odometry_of_a_frame_apart_from_depth_is_named(tmp_path: Path) -> None:
-    bag = Bag(tmp_path, "ros2")
-    depth_bag(bag)
-    for k, T in enumerate(T_WORLD_RIG):
-        bag.odometry("/odom", 10 + 0.1 * k, "odom", "base", T)
-    recording = open_recording(bag.close())
-    assert recording.odometry is None
-    assert any("odometry has frames that move" in line for line in recording.warnings)
-
-
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])
 def test_gravity_of_an_accelerometer(tmp_path: Path, kind: str) -> None:
     """It measures g upwards at rest, in its own axes; a gyroscope measures none."""
     bag = Bag(tmp_path, kind)
-    depth_bag(bag)
+    bag.depth(count=3)
     T_DEPTH_IMU = exp(np.array([0.3, 0.0, 0.1, 0.4, -1.2, 2.0]))
     bag.tf("/tf_static", 9.0, "depth", "imu", T_DEPTH_IMU)
     down = np.array([[0.0, 1.0, 0.0], [0.6, 0.8, 0.0], [0.0, 0.8, 0.6]])  # in each image
@@ -671,34 +650,3 @@ def test_gravity_of_an_accelerometer(tmp_path: Path, kind: str) -> None:
     assert recording.gravity is not None
     np.testing.assert_allclose(recording.gravity[:, :3], down, atol=1e-6)
     assert recording.metadata["imu_topic"] == "/c/accel"
-
-
-def test_accelerometer_apart_from_depth_is_named(tmp_path: Path) -> None:
-    bag = Bag(tmp_path, "ros2")
-    depth_bag(bag)
-    bag.imu("/imu", 10.0, "elsewhere", np.array([0.0, 0.0, 9.8]))
-    recording = open_recording(bag.close())
-    assert recording.gravity is None
-    assert any("gravity in /imu is ignored: the relation" in line for line in recording.warnings)
-
-
-def test_tf_of_another_clock_is_named(tmp_path: Path) -> None:
-    bag = Bag(tmp_path, "mcap")
-    bag.info("/a/depth/camera_info")
-    for k in range(3):
-        bag.image("/a/depth/image", 10 + k / 10, COUNTS[k], "16UC1")
-        bag.tf("/tf", 1e9 + k / 10, "odom", "depth", exp([k, 0, 0, 0, 0, 0]))
-    recording = open_recording(bag.close())
-    assert recording.odometry is None
-    assert any("moves, but at no time of an image" in line for line in recording.warnings)
-
-
-def test_tf_without_the_frame_of_depth(tmp_path: Path) -> None:
-    """The latched /tf_static is missing: the robot moves, and nothing says where the camera is."""
-    bag = Bag(tmp_path, "mcap")
-    depth_bag(bag)
-    for k, T in enumerate(T_WORLD_RIG):
-        bag.tf("/tf", 9.95 + 0.1 * k, "odom", "base_link", T)
-    recording = open_recording(bag.close())
-    assert recording.odometry is None
-    assert any("/tf_static was not recorded" in line for line in recording.warnings)

@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +15,12 @@ import made_sens
 import made_tof
 from camera_files import EVERY, MAKERS, made, read_frames
 from damaged_files import damage
+from made_phones import CX, CY, DEPTH, FX, millimetres
 from made_tof import adi_frame
+from phone_checks import check_frames, check_lens
 from tofuse.engine.errors import InputError, TofuseError
 from tofuse.engine.frames.recording import Recording
+from tofuse.formats.images.images import write_png
 from tofuse.formats.recordings.open import open_recording, readers
 
 # `benchmarks/attack.py` runs any number.
@@ -26,61 +30,65 @@ ELSEWHERE = {"tiff", "depth-png", "las", "e57"}
 
 
 def digest(recording: Recording) -> list[float]:
-    """Numbers that change if points, their pixels, channels, times or poses do."""
-    totals = np.zeros(6)
+    """Numbers that change if points, their pixels, channels, times, poses or warnings do."""
+    totals = np.zeros(7)
     for frame in recording:
         order = np.linspace(1, 2, len(frame))
         totals[0] += len(frame)
         totals[1:4] += order @ frame.points / len(frame)
-        for k, channel in ((4, frame.amplitude), (5, frame.color)):
+        image = getattr(frame, "confidence_image", None)
+        sure = None if image is None else image[frame.valid]
+        for k, channel in enumerate((frame.amplitude, frame.color, sure), 4):
             if channel is not None:
                 totals[k] += order @ channel.reshape(len(frame), -1).mean(1) / len(frame)
     times = np.asarray(recording.timestamps)
     poses = [np.nansum(p) for p in (recording.reference, recording.odometry) if p is not None]
-    return [*totals.tolist(), float(times[-1] - times[0]), float(sum(poses))]
+    rest = [times[0] % 1000, times[-1] - times[0], sum(poses), len(recording.warnings)]
+    return [*totals.tolist(), *map(float, rest)]
 
 
-# Valid points, means of x, y, z, amplitude and colour, duration, and sum of all poses.
+# Valid points, means of x, y, z, amplitude, colour and confidence, first time modulo 1000 s,
+# duration, sum of all poses, and number of warnings.
 DIGESTS: dict[str, tuple[float, ...]] = {
-    "3dscannerapp": (2301, 0.038234, 0.60273, 9.7493, 0, 85.385, 0.4, 9.1929),
-    "stray": (2301, 0.038276, 0.60321, 9.7493, 0, 0, 0.033333, 9.1929),
-    "arkitscenes": (2301, 0.038234, 0.60273, 9.7493, 0, 255.35, 0.2, 9.1929),
-    "record3d": (2301, 0.031023, 0.80159, 9.7562, 0, 256.32, 0.033333, 9.1929),
-    "mkv": (1.8427e+05, -0.19698, -0.44597, 6.0053, 2000.8, 60.979, 0.033333, 0),
-    "o3r": (642, -0.028973, 0.53476, 6.9903, 1.4191e+05, 0, 0.1, 0),
-    "npz": (570, -0.035101, 0.46616, 11.877, 223.28, 573.72, 0.3, 18.339),
-    "sens": (3599, 0.10151, 0.34361, 7.2086, 0, 380.35, 0.066666, 8.24),
-    "scannet": (3599, 0.10151, 0.34361, 7.2086, 0, 380.35, 0.066667, 8.24),
-    "zense": (570, -0.036309, 0.49361, 12.328, 0, 0, 0.13333, 0),
-    "helios": (1845, 0.29965, 0.3251, 8.8547, 9101.4, 0, 2, 0),
-    "csv": (1845, 0.29964, 0.32509, 8.8548, 9101.4, 0, 2, 0),
-    "r3d": (2301, 0.031, 0.8016, 9.7561, 0, 256.32, 0.033333, 9.1929),
-    "polycam": (2301, 0.038234, 0.60273, 9.7493, 0, 256.39, 0.5, 9.1929),
-    "nerfstudio": (2301, -0.05253, 0.56447, 9.7493, 0, 256.39, 2, 9.1929),
-    "nerfcapture": (2301, -0.12047, 0.25763, 9.7493, 0, 255.35, 0.2, 9.1929),
-    "hololens2": (2277, -0.023627, 0.52068, 8.4627, 5390.9, 0, 0.4, 9.1929),
-    "kinect2": (6.2054e+05, 0.0043393, 0.3808, 4.95, 0, 170.77, 2, 0),
-    "depth16": (2301, 0.038477, 0.42185, 9.7493, 0, 85.385, 0.2, 0),
-    "arducam": (2292, 0.051926, 0.43612, 9.7456, 0, 0, 0.2, 0),
-    "aditof": (9153, -0.33457, 0.48241, 8.6021, 3227.6, 0, 0.5, 0),
-    "native": (3600, 0.018199, 0.39758, 8.582, 900, 225, 0.2, 24),
-    "sr4000": (573, 0.057247, 0.3644, 11.491, 479.09, 0, 0.0625, 0),
-    "tum": (9.2159e+05, 0.0013921, 0.045244, 2.0231, 0, 4.5, 0.066667, -1.4855),
-    "7scenes": (9.2159e+05, -0.0071238, 0.45309, 10.115, 0, 4.5, 0.13333, -1.4855),
-    "redwood": (9.2159e+05, 0.0016957, 0.51451, 10.115, 0, 4.5, 0.066738, -1.4855),
-    "sun3d": (9216, 0.20337, 0.33357, 10.844, 0, 167.94, 0.132, 10.292),
-    "replica": (9216, 0.20338, 0.33357, 10.844, 0, 167.94, 2, 10.292),
-    "bop": (9216, 0.20338, 0.33357, 10.844, 0, 167.94, 2, 10.292),
-    "pairs": (9216, 0.20338, 0.33357, 10.844, 0, 167.94, 2, 0),
-    "pcd": (1655, 6.817, 7.1366, 13.63, 0, 0, 2, 8),
-    "ply": (32, 1.0201, 0.91402, 0.74226, 0, 0, 1, 4),
-    "xyz": (4, 9, 12, 15, 0, 10.5, 1, 0),
-    "slam6d": (4, 0.09, -0.12, 0.15, 0, 0, 1, 15.955),
-    "ptx": (16, 14.333, 16, 20.5, 1.75, 16.444, 2, 60),
-    "h5": (642, -0.028973, 0.53476, 6.9903, 1.4191e+05, 0, 0.1, 0),
-    "mcap": (576, 0.035607, 0.4362, 12.523, 0, 0, 2, 0),
-    "realsense": (576, 0.033295, 0.28397, 8.625, 592.37, 443.27, 0.066667, 0),
-    "orbbec": (576, 0.033295, 0.28397, 8.625, 6260.6, 664.63, 0.13333, 0),
+    "3dscannerapp": (2301, 0.038234, 0.60273, 9.7493, 0, 85.385, 4.5409, 0.5, 0.4, 9.1929, 1),
+    "stray": (2301, 0.038276, 0.60321, 9.7493, 0, 0, 4.5409, 100, 0.033333, 9.1929, 1),
+    "arkitscenes": (2301, 0.038234, 0.60273, 9.7493, 0, 255.35, 4.5409, 418.328, 0.2, 9.1929, 0),
+    "record3d": (2301, 0.031023, 0.80159, 9.7562, 0, 256.32, 0, 0, 0.033333, 9.1929, 1),
+    "mkv": (1.8427e+05, -0.19698, -0.44597, 6.0053, 2000.8, 60.979, 0, 5.000007, 0.033333, 0, 0),
+    "o3r": (642, -0.028973, 0.53476, 6.9903, 1.4191e+05, 0, 0, 0, 0.1, 0, 0),
+    "npz": (570, -0.035101, 0.46616, 11.877, 223.28, 573.72, 16.029, 5, 0.3, 18.339, 0),
+    "sens": (3599, 0.10151, 0.34361, 7.2086, 0, 380.35, 0, 1e-05, 0.066666, 8.24, 0),
+    "scannet": (3599, 0.10151, 0.34361, 7.2086, 0, 380.35, 0, 0, 0.066667, 8.24, 0),
+    "zense": (570, -0.036309, 0.49361, 12.328, 0, 0, 0, 0, 0.13333, 0, 1),
+    "helios": (1845, 0.29965, 0.3251, 8.8547, 9101.4, 0, 0, 0, 2, 0, 1),
+    "csv": (1845, 0.29964, 0.32509, 8.8548, 9101.4, 0, 0, 0, 2, 0, 0),
+    "r3d": (2301, 0.031, 0.8016, 9.7561, 0, 256.32, 4.544, 0, 0.033333, 9.1929, 0),
+    "polycam": (2301, 0.038234, 0.60273, 9.7493, 0, 256.39, 4.5409, 5, 0.5, 9.1929, 0),
+    "nerfstudio": (2301, -0.05253, 0.56447, 9.7493, 0, 256.39, 0, 0, 2, 9.1929, 1),
+    "nerfcapture": (2301, -0.12047, 0.25763, 9.7493, 0, 255.35, 0, 7, 0.2, 9.1929, 0),
+    "hololens2": (2277, -0.023627, 0.52068, 8.4627, 5390.9, 0, 0, 0, 0.4, 9.1929, 0),
+    "kinect2": (6.2054e+05, 0.0043393, 0.3808, 4.95, 0, 170.77, 0, 0, 2, 0, 2),
+    "depth16": (2301, 0.038477, 0.42185, 9.7493, 0, 85.385, 23.945, 0, 0.2, 0, 1),
+    "arducam": (2292, 0.051926, 0.43612, 9.7456, 0, 0, 185.04, 0, 0.2, 0, 0),
+    "aditof": (9153, -0.33457, 0.48241, 8.6021, 3227.6, 0, 0, 0, 0.5, 0, 0),
+    "native": (3600, 0.018199, 0.39758, 8.582, 900, 225, 31.5, 0, 0.2, 24, 1),
+    "sr4000": (573, 0.057247, 0.3644, 11.491, 479.09, 0, 22.5, 0, 0.0625, 0, 0),
+    "tum": (9.2159e+05, 0.0013921, 0.045244, 2.0231, 0, 4.5, 0, 102.16, 0.066667, -1.4855, 0),
+    "7scenes": (9.2159e+05, -0.0071238, 0.45309, 10.115, 0, 4.5, 0, 0, 0.13333, -1.4855, 2),
+    "redwood": (9.2159e+05, 0.0016957, 0.51451, 10.115, 0, 4.5, 0, 0, 0.066738, -1.4855, 1),
+    "sun3d": (9216, 0.20337, 0.33357, 10.844, 0, 167.94, 0, 0, 0.132, 10.292, 0),
+    "replica": (9216, 0.20338, 0.33357, 10.844, 0, 167.94, 0, 0, 2, 10.292, 0),
+    "bop": (9216, 0.20338, 0.33357, 10.844, 0, 167.94, 0, 0, 2, 10.292, 0),
+    "pairs": (9216, 0.20338, 0.33357, 10.844, 0, 167.94, 0, 0, 2, 0, 0),
+    "pcd": (1655, 6.817, 7.1366, 13.63, 0, 0, 0, 0, 2, 8, 1),
+    "ply": (32, 1.0201, 0.91402, 0.74226, 0, 0, 0, 0, 1, 4, 1),
+    "xyz": (4, 9, 12, 15, 0, 10.5, 0, 0, 1, 0, 0),
+    "slam6d": (4, 0.09, -0.12, 0.15, 0, 0, 0, 0, 1, 15.955, 1),
+    "ptx": (16, 14.333, 16, 20.5, 1.75, 16.444, 0, 0, 2, 60, 0),
+    "h5": (642, -0.028973, 0.53476, 6.9903, 1.4191e+05, 0, 0, 0, 0.1, 0, 0),
+    "mcap": (576, 0.035607, 0.4362, 12.523, 0, 0, 0, 10, 2, 0, 0),
+    "realsense": (576, 0.033295, 0.28397, 8.625, 592.37, 443.27, 0, 10, 0.066667, 0, 0),
+    "orbbec": (576, 0.033295, 0.28397, 8.625, 6260.6, 664.63, 0, 10, 0.13333, 0, 0),
 }  # fmt: skip
 
 
@@ -94,6 +102,35 @@ def test_recording_is_read_completely(tmp_path: Path, name: str) -> None:
     recording = open_recording(tmp_path / path)
     assert recording.format == format_
     np.testing.assert_allclose(digest(recording), DIGESTS[name], rtol=1e-3, atol=2e-4)
+
+
+# Recordings of the depth, colour and poses of `made_phones`: options of the check, and by how many
+# pixels the focal length grows from frame to frame.
+PHONES: dict[str, tuple[dict[str, Any], int]] = {
+    "3dscannerapp": ({}, 1),
+    "stray": ({}, 0),
+    "arkitscenes": ({}, 1),
+    "polycam": ({}, 1),
+    "record3d": ({"turned": True, "exact": 2e-3}, 0),  # half floats
+    "r3d": ({"turned": True, "exact": 0}, 0),
+}
+
+
+@pytest.mark.parametrize("name", PHONES)
+def test_phones_are_read_as_they_were_written(tmp_path: Path, name: str) -> None:
+    options, growth = PHONES[name]
+    path, _ = made(name, tmp_path)
+    recording = open_recording(tmp_path / path)
+    check_frames(recording, **options)
+    center = (CY, CX) if "turned" in options else (CX, CY)
+    for k, frame in enumerate(recording):
+        check_lens(frame, FX + growth * k, *center)
+
+
+def turned_depth(path: Path) -> None:
+    """The lens is of ARKit's landscape images: scaled to upright ones it would have two scales."""
+    for k in range(3):
+        write_png(path / f"depth_{k:05d}.png", millimetres(DEPTH[k]).T)
 
 
 @pytest.mark.parametrize("name", ["polycam", "3dscannerapp", "7scenes", "scannet", "redwood"])
@@ -210,6 +247,7 @@ DAMAGED: list[tuple[str, Change, str | tuple[int, ...], str]] = [
     ("ptx", cut(20, "b.ptx"), (2,), "b.ptx: has 4 lines of 4 numbers, not 6 of 4 or 7"),
     ("ptx", replaced(b"0 1 0 0", b"0 1 0 9", "b.ptx"), (), "can't be read"),
     ("3dscannerapp", put("frame_00001.json", '{"time": 1}'), (1,), "intrinsics: is missing"),
+    ("3dscannerapp", turned_depth, REFUSED, "1920 x 1440 image, depth 24 x 32: another aspect"),
     ("stray", drop("camera_matrix.csv"), REFUSED, "camera_matrix.csv: is missing"),
     ("stray", put("odometry.csv", "timestamp,frame,x,y,z,qx,qy,qz,qw\n"), REFUSED, "no timestamp"),
     ("stray", put("imu.csv", "timestamp,a_x,a_y,a_z,alpha_x,alpha_y,alpha_z\n"), (), ""),
@@ -273,9 +311,7 @@ DAMAGED: list[tuple[str, Change, str | tuple[int, ...], str]] = [
 
 
 @pytest.mark.parametrize(("name", "change", "outcome", "says"), DAMAGED)
-def test_damage_is_reported(
-    tmp_path: Path, name: str, change: Change, outcome: str | tuple[int, ...], says: str
-) -> None:
+def test_damage_is_reported(tmp_path, name, change, outcome, says) -> None:
     path, format_ = made(name, tmp_path)
     change(tmp_path / path)
     if outcome == REFUSED:

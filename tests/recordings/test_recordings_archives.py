@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import made_phones as made
+from refused import refused
 from tofuse.apps.cli.program import main
 from tofuse.apps.inspection.inspect import inspect_recording
 from tofuse.engine.errors import InputError, InputWarning, UnreadableFrameError
@@ -63,8 +64,7 @@ def test_archive_that_is_not_unpacked_is_named_so(tmp_path: Path) -> None:
     zipped(tmp_path / "scan", tmp_path / "folder" / "scan.zip")
     (tmp_path / "scan.tar.gz").write_bytes(b"\x1f\x8b")
     for name in ("folder", "scan.tar.gz"):
-        with pytest.raises(InputError, match=r"is an archive, .* unpack any other"):
-            open_recording(tmp_path / name)
+        refused(r"is an archive, .* unpack any other", tmp_path / name)
 
 
 def test_archive_in_an_archive(tmp_path: Path) -> None:
@@ -76,15 +76,13 @@ def test_archive_in_an_archive(tmp_path: Path) -> None:
         inner = tmp_path / name
     assert len(open_recording(tmp_path / "once.zip")) == 3
     # One that contains itself would never end.
-    with pytest.raises(InputError, match=r"^\S*twice.zip/\S*: is an archive"):
-        open_recording(tmp_path / "twice.zip")
+    refused(r"^\S*twice.zip/\S*: is an archive", tmp_path / "twice.zip")
 
 
 def test_archive_beside_a_folder_is_not_all_there_is(tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     (tmp_path / "scan.zip").touch()
-    with pytest.raises(InputError, match=r"it contains 1 \S+, 1 \S+"):
-        open_recording(tmp_path)
+    refused(r"it contains 1 \S+, 1 \S+", tmp_path)
 
 
 def test_archive_of_single_file_is_that_file(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,10 +10,12 @@ import pytest
 
 import made_arrays
 from camera_files import EVERY, made
+from refused import refused
 from ros_bags import COUNTS, TOPIC, Bag
 from tofuse.engine.cameras.cameras import BrownConrady, Pinhole, RayTable
 from tofuse.engine.errors import InputError
 from tofuse.formats.recordings.open import open_recording
+from written import camera_json
 
 
 def npz_metres(path: Path) -> Path:
@@ -60,15 +61,12 @@ def recorded(case: str, folder: Path) -> tuple[Path, str]:
 def camera_file(
     folder: Path, size: tuple[int, int], unit: float, kind: str
 ) -> tuple[Path, BrownConrady]:
-    lens = BrownConrady(
-        *size, 1.1 * size[0], 1.2 * size[0], size[0] / 2, size[1] / 2, k1=0.05, p2=0.001
-    )
-    fields = {"schema": 1, "model": "brown", "width": size[0], "height": size[1]}
-    fields |= {name: getattr(lens, name) for name in ("fx", "fy", "cx", "cy")}
-    fields |= {"distortion": [0.05, 0, 0, 0.001], "depth_unit_m": unit, "depth_kind": kind}
+    center = (size[0] / 2, size[1] / 2)
+    lens = BrownConrady(*size, 1.1 * size[0], 1.2 * size[0], *center, k1=0.05, p2=0.001)
+    bent = {"model": "brown", "distortion": [0.05, 0, 0, 0.001]}
     folder.mkdir()
-    (folder / "camera.json").write_text(json.dumps(fields))
-    return folder / "camera.json", lens
+    path = folder / "camera.json"
+    return camera_json(path, lens, **bent, depth_unit_m=unit, depth_kind=kind), lens
 
 
 @pytest.mark.parametrize("case", [*TAKES, *METRES])
@@ -117,5 +115,9 @@ def test_ray_table_is_used_and_other_size_refused(tmp_path: Path, case: str) -> 
 def test_camera_is_refused_where_not_applicable(tmp_path: Path, name: str) -> None:
     file, _ = camera_file(tmp_path / "given", (16, 12), 0.001, "z")
     path, format_ = made(name, tmp_path)
-    with pytest.raises(InputError, match=r"camera: does not apply to the format .*leave it out"):
-        open_recording(tmp_path / path, format=format_, camera=file)
+    refused(
+        r"camera: does not apply to the format .*leave it out",
+        tmp_path / path,
+        format=format_,
+        camera=file,
+    )

@@ -187,18 +187,10 @@ def test_channels() -> None:
         amplitude = np.full((96, 120), 100.0 + k, np.float32)
         amplitude[5, 5] = SATURATED_AMPLITUDE
         amplitude[5, 6] = SATURATED_AMPLITUDE if k == 0 else 200.0
-        confidence = np.full((96, 120), k, np.uint8)
-        color = np.full((96, 120, 3), 10 * k, np.uint8)
-        frames.append(
-            shot(
-                k,
-                scene(),
-                amplitude_image=amplitude,
-                amplitude_kind="range_compensated",
-                confidence_image=confidence,
-                color_image=color,
-            )
-        )
+        images = {"amplitude_image": amplitude, "amplitude_kind": "range_compensated"}
+        images |= {"confidence_image": np.full((96, 120), k, np.uint8)}
+        images |= {"color_image": np.full((96, 120, 3), 10 * k, np.uint8)}
+        frames.append(shot(k, scene(), **images))
     frame = average_of(frames, MODEL)
     assert np.median(frame.amplitude_image) == pytest.approx(101.5)
     assert frame.amplitude_image[5, 5] == SATURATED_AMPLITUDE

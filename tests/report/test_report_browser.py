@@ -39,6 +39,7 @@ def opened(browser, report, **options):
             "document.querySelectorAll('details').forEach((d) => { d.open = true; })"
         )
         yield seen
+        seen.check()
 
 
 CANVAS = "#viewer .stage canvas"
@@ -88,7 +89,6 @@ def test_model_rotates_and_toggles_switch(browser, report):
             blue, red = ink[..., 0], ink[..., 2]
             strong = (red - blue > 100) if orange else (blue - red > 100)
             assert strong.sum() > 50
-        seen.check()
 
 
 def test_two_taps_measure_distance_with_error(browser, report):
@@ -122,7 +122,6 @@ def test_two_taps_measure_distance_with_error(browser, report):
         assert 2 < float(match[3]) < 150
         page.keyboard.press("Escape")
         assert caption.is_hidden()
-        seen.check()
 
 
 def test_page_bounds_lengths_as_python_does(browser):
@@ -181,7 +180,6 @@ def test_filled_holes_are_not_measured(browser, tmp_path):
             seen.page.get_by_role("button", name="Measure").click()
             seen.page.mouse.click(*middle(seen.page))
             assert words in seen.page.locator("#viewer .measured").inner_text()
-            seen.check()
 
 
 def test_page_without_scripts_folds_nothing_empty(browser, report):
@@ -213,7 +211,6 @@ def test_phone_scrolls_past_model(browser, report):
         swipe(0, -160)
         seen.rest()
         assert page.evaluate("scrollY") > 80
-        seen.check()
 
 
 def test_folded_page_is_short_and_links_unfold_it(browser, report):
@@ -248,7 +245,6 @@ def test_slider_shows_frames_and_reason_of_loss(browser, report):
         assert caption.startswith("Frame 10: lost – too few correspondences: 31 of 1000")
         page.locator("#strip rect[data-frame='0']").click(force=True)
         assert page.locator("#frame-description").inner_text().startswith("Frame 0:")
-        seen.check()
 
 
 @pytest.mark.parametrize(("size", "scheme"), [(DESK, "light"), (PHONE, "dark")])
@@ -270,7 +266,6 @@ def test_layout_follows_scheme_and_screen_size(browser, report, scheme, size):
         assert not rows[[0, -1]].any()
         assert not columns[[0, -1]].any()
         assert max(rows.mean(), columns.mean()) > 0.7
-        seen.check()
 
 
 def test_charts_are_drawn_when_seen_and_follow_pointer_and_theme(browser, report):
@@ -299,7 +294,6 @@ def test_charts_are_drawn_when_seen_and_follow_pointer_and_theme(browser, report
         seen.rest()
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         assert charts.first.locator("canvas").bounding_box()["width"] > 300
-        seen.check()
 
 
 def test_chart_in_closed_details_is_drawn_on_opening(browser, report, tmp_path):

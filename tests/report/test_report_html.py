@@ -116,28 +116,14 @@ def shown(tmp_path_factory):
 
 
 ORDER = [
-    "model",
-    "summary",
-    "verdict",
-    "frames",
-    "views",
-    "error",
-    "objective",
-    "filters",
-    "loops",
-    "recording",
-    "timings",
-    "settings",
-    "reading",
-]
+    "model", "summary", "verdict", "frames", "views", "error", "objective", "filters", "loops",
+    "recording", "timings", "settings", "reading",
+]  # fmt: skip
 
 
 def test_model_is_shown_alone_at_first(shown):
-    checked = {
-        n
-        for n, on in re.findall(r'type="checkbox" name="(\w+)"[^>]*?( checked)?>', shown.text)
-        if on
-    }
+    boxes = re.findall(r'type="checkbox" name="(\w+)"[^>]*?( checked)?>', shown.text)
+    checked = {name for name, on in boxes if on}
     assert checked & {"mesh", "points"}
     assert not checked & {"after", "before", "reference", "loops"}
 
@@ -187,11 +173,8 @@ def test_errors_are_relative_to_reference(shown):
             assert float(number) * {"mm": 1e-3, "m": 1}[unit] == pytest.approx(value, rel=0.06)
     last = se3.angle(se3.inverse(extras.reference[-1]) @ result.diagnostics.sequential[-1])
     assert shown.row("Before, last frame")[5] == f"{np.degrees(last):.2f}°"
-    worst = np.nanargmax(
-        np.linalg.norm(
-            result.trajectory[:, :3, 3] - result.diagnostics.sequential[:, :3, 3], axis=1
-        )
-    )
+    moved = result.trajectory[:, :3, 3] - result.diagnostics.sequential[:, :3, 3]
+    worst = np.nanargmax(np.linalg.norm(moved, axis=1))
     assert f"most at frame {worst}." in shown.sections["error"]
 
 
@@ -204,9 +187,8 @@ def test_rotated_model_is_measured_along_its_own_sides(exact, tmp_path):
     box = surface * [0.3, 0.4, 0.6]
     points = se3.transform(se3.exp([0.2, 0, 1, 0, 0.4, 0]), box).astype(np.float32)
     cloud = Cloud(points, None, None, np.ones(len(points), np.int32))
-    got = page(
-        tmp_path, lonely(cloud=cloud), ReportExtras("x", truth_points=points if exact else None)
-    )
+    extras = ReportExtras("x", truth_points=points if exact else None)
+    got = page(tmp_path, lonely(cloud=cloud), extras)
     for name, size in (("width", 0.3), ("height", 0.4), ("depth", 0.6)):
         for cell in got.row(name)[1:3]:
             assert float(cell.split()[0]) == pytest.approx(size, abs=0.011)
@@ -253,10 +235,8 @@ def test_reasons_name_their_frames(tmp_path):
     frames = tuple(FrameRecord(k, 0.1 * k, "tracked") for k in range(90))
     reason = Reason("images_differ", ((3, 4), (20, 34), (50, 50)), "Surfaces do not agree.")
     result = lonely(verdict="degraded", reasons=(reason,), frames=frames)
-    text_of_verdict = " ".join(
-        page(tmp_path, result, ReportExtras("x")).sections["verdict"].split()
-    )
-    assert "Surfaces do not agree (frames 3-4, 20-34, 50)." in text_of_verdict
+    text = page(tmp_path, result, ReportExtras("x")).sections["verdict"]
+    assert "Surfaces do not agree (frames 3-4, 20-34, 50)." in " ".join(text.split())
 
 
 def test_summary_of_a_single_image_speaks_of_no_parts(tmp_path):
@@ -338,9 +318,8 @@ def test_components_are_listed_with_their_own_models(tmp_path):
 
 def test_lost_frames_state_their_reason(shown):
     assert len([t for t in shown.titles if t.startswith("Frame ")]) == 24
-    assert any(
-        t.startswith("Frame 9: lost – too few correspondences: 31 of 1000") for t in shown.titles
-    )
+    lost = "Frame 9: lost – too few correspondences: 31 of 1000"
+    assert any(title.startswith(lost) for title in shown.titles)
     assert shown.row("frames 9–10")[1:] == ["2", "lost", "too few correspondences: 31 of 1000"]
     assert shown.row("frame 15")[2:] == ["skipped", "depth/000015.png: is truncated"]
 
@@ -427,9 +406,8 @@ def test_viewer_contains_model_cameras_and_loops(shown):
 def test_charts_have_values_gaps_and_text(shown):
     inliers, residual, x, _, _, rotation, objective = shown.charts
     result, _ = room()
-    expected = [
-        100 * r.inlier_share for r in result.diagnostics.frames if r.inlier_share is not None
-    ]
+    shares = [record.inlier_share for record in result.diagnostics.frames]
+    expected = [100 * share for share in shares if share is not None]
     values = [v for v in inliers["series"]["after"] if v is not None]
     np.testing.assert_allclose(values, expected, rtol=1e-4)
     assert inliers["series"]["after"][15] is None
@@ -484,18 +462,12 @@ def test_model_without_colours_begins_with_its_shape(tmp_path):
 
 def test_model_can_be_coloured_by_attributes_of_points():
     points = np.array([[0, -2.0, 1], [0, -1, 1], [0, 0, 1], [1, 0, 2]], np.float32)
-    cloud = Cloud(
-        points,
-        None,
-        None,
-        np.array([1, 2, 3, 4], np.int32),
-        np.array([0.001, 0.002, 0.004, UNKNOWN_M], np.float32),
-    )
+    sigma = np.array([0.001, 0.002, 0.004, UNKNOWN_M], np.float32)
+    cloud = Cloud(points, None, None, np.array([1, 2, 3, 4], np.int32), sigma)
     found = {f.name: f for f in fields(make_scene(lonely(cloud=cloud), {}))}
     assert list(found) == ["accuracy", "height", "views"]
-    of = {
-        name: unpack(f.packed()["values"], "u1", 1)[:, 0].astype(int) for name, f in found.items()
-    }
+    packed_values = {name: field.packed()["values"] for name, field in found.items()}
+    of = {name: unpack(v, "u1", 1)[:, 0].astype(int) for name, v in packed_values.items()}
     assert of["height"].tolist() == [255, pytest.approx(128, abs=3), 0, 0]
     assert (np.diff(of["views"]) > 0).all()
     # The bar covers constrained points; unconstrained ones are beyond its end, and named there.
@@ -544,23 +516,16 @@ def test_external_text_is_escaped(tmp_path):
 
 def many(number):
     """A long recording in which every third frame is lost, each for another reason."""
-    frames = [
-        FrameRecord(
-            k, k / 10, "lost" if k % 3 == 1 else "tracked", f"reason {k}" if k % 3 == 1 else ""
-        )
+    frames = tuple(
+        FrameRecord(k, k / 10, *(("lost", f"reason {k}") if k % 3 == 1 else ("tracked", "")))
         for k in range(number)
-    ]
+    )
     poses = np.tile(np.eye(4), (number, 1, 1))
     poses[:, 0, 3] = np.arange(number) * 0.01
     poses[1::3] = np.nan
     loops = tuple(LoopRecord(k, k + 50, False, "too far") for k in range(300))
-    return lonely(
-        trajectory=poses,
-        timestamps=np.arange(number) / 10,
-        sequential=poses,
-        frames=tuple(frames),
-        loops=loops,
-    )
+    posed = {"trajectory": poses, "timestamps": np.arange(number) / 10, "sequential": poses}
+    return lonely(**posed, frames=frames, loops=loops)
 
 
 @pytest.mark.nightly
@@ -587,29 +552,27 @@ def dark():
     return FrameSample.of(unlit(), unlit(), unlit())
 
 
+def still(count, pose=None, **changes):
+    """A camera whose poses are all the same."""
+    poses = np.tile(np.eye(4) if pose is None else pose, (count, 1, 1))
+    times = np.arange(float(count))
+    return lonely(trajectory=poses, timestamps=times, sequential=poses, **changes)
+
+
+def records(*statuses):
+    return tuple(FrameRecord(k, float(k), status) for k, status in enumerate(statuses))
+
+
 POOR = {
     "one cloud": (lonely(), ReportExtras("x", (("raw", cloud_frame()),), clouds=(cloud_frame(),))),
     "nothing read": (
-        lonely(
-            trajectory=np.zeros((0, 4, 4)),
-            timestamps=np.zeros(0),
-            cloud=empty_cloud(),
-            frames=(),
-            sequential=np.zeros((0, 4, 4)),
-            reasons=(),
-            verdict="failed",
-        ),
+        still(0, cloud=empty_cloud(), frames=(), reasons=(), verdict="failed"),
         ReportExtras("x"),
     ),
     "all lost": (
-        lonely(
-            trajectory=np.full((2, 4, 4), np.nan),
-            timestamps=np.zeros(2),
-            cloud=empty_cloud(),
-            frames=(FrameRecord(0, 0.0, "lost", "why"), FrameRecord(1, 1.0, "lost", "why")),
-            sequential=np.full((2, 4, 4), np.nan),
-            reasons=(Reason("few_poses", ((0, 1),), "no frame has a pose"),),
-            verdict="failed",
+        still(
+            2, np.full((4, 4), np.nan), cloud=empty_cloud(), frames=records("lost", "lost"),
+            reasons=(Reason("few_poses", ((0, 1),), "no frame has a pose"),), verdict="failed",
         ),
         ReportExtras("x", reference=np.tile(np.eye(4), (2, 1, 1))),
     ),
@@ -625,28 +588,17 @@ POOR = {
         ReportExtras("x", (("raw", unlit()), ("median", unlit()))),
     ),
     "stationary camera": (
-        lonely(
-            trajectory=np.tile(np.eye(4), (3, 1, 1)),
-            timestamps=np.arange(3.0),
-            sequential=np.tile(np.eye(4), (3, 1, 1)),
-            frames=tuple(FrameRecord(k, k, "tracked", "", 0.0, 0.0, 0.0) for k in range(3)),
-        ),
+        still(3, frames=tuple(FrameRecord(k, k, "tracked", "", 0.0, 0.0, 0.0) for k in range(3))),
         ReportExtras("x", reference=np.full((3, 4, 4), np.nan)),
     ),
     "skipped frames without a row": (
-        lonely(
-            trajectory=np.tile(np.eye(4), (2, 1, 1)),
-            timestamps=np.arange(2.0),
-            sequential=np.tile(np.eye(4), (2, 1, 1)),
-            frames=tuple(
-                FrameRecord(k, k, status)
-                for k, status in enumerate(("tracked", "skipped", "tracked"))
-            ),
+        still(
+            2, frames=records("tracked", "skipped", "tracked"),
             loops=(LoopRecord(0, 2, True, ""), LoopRecord(0, 7, True, "")),
         ),
         ReportExtras("x"),
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.nightly

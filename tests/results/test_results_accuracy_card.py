@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cli_calls import refuses
 from made_results import result
-from tofuse.apps.cli.program import main
 from tofuse.engine.quality.pose_accuracy import Accuracy, WorstFrame
 from tofuse.engine.results.accuracy_card import SEPARATOR, bound, card, weakest_frame
 from tofuse.engine.results.types import Reason
@@ -65,8 +65,5 @@ def test_unbounded_and_unassessed_accuracy() -> None:
 
 @pytest.mark.parametrize("text", ["0", "-1mm", "3 km", "mm", "nan", "inf", "1e999", "", "3mmm"])
 def test_invalid_tolerance_is_refused(text, room_recording, tmp_path, capsys) -> None:
-    words = ["run", str(room_recording), "--out", str(tmp_path / "out"), f"--tolerance={text}"]
-    with pytest.raises(SystemExit) as ended:
-        main(words)
-    assert ended.value.code == 2
-    assert "is not a length, such as 30mm" in capsys.readouterr().err
+    words = ("run", room_recording, "--out", tmp_path / "out", f"--tolerance={text}")
+    refuses(capsys, *words, says="is not a length, such as 30mm", prefix="tofuse run: ")

@@ -35,15 +35,20 @@ def registration(share=0.5, converged=True, unheld=False) -> Registration:
 
 
 def pair(i, j, share=0.95, rms=0.004, compared=10_000) -> PairConsistency:
-    return PairConsistency(
-        i, j, share * compared, (1 - share) * compared, share * compared * rms**2
-    )
+    seen = share * compared
+    return PairConsistency(i, j, seen, compared - seen, seen * rms**2)
 
 
 def seen(far_share=0.95, far_rms=0.004, near_share=0.95, near_rms=0.004) -> CrossViewConsistency:
     near = [pair(k, k + 1, near_share, near_rms) for k in range(8)]
     far = [pair(i, j, far_share, far_rms) for i in range(9) for j in range(i + 2, 9)]
     return CrossViewConsistency(tuple(range(9)), tuple(near + far))
+
+
+def closing(poses, ends, rows, gap=(0.0,) * 6, information=None) -> Measured:
+    """A measured motion between two poses, off by a 6-vector."""
+    T = se3.inverse(poses[rows[0]]) @ poses[rows[1]] @ se3.exp(-np.asarray(gap, float))
+    return Measured(*ends, T, np.eye(6) if information is None else information)
 
 
 def evidence(
@@ -82,33 +87,20 @@ def evidence(
     sequence = [Measured(a, b, STEP, information) for a, b in pairwise(posed)]
     row = {frame: k for k, frame in enumerate(posed)}
     closed = [
-        Measured(
-            i,
-            j,
-            se3.inverse(poses[row[i]]) @ poses[row[j]] @ se3.exp(-np.asarray(gap, float)),
-            information,
-        )
+        closing(poses, (i, j), (row[i], row[j]), gap, information)
         for i, j, gap in gaps
         if i in row and j in row
     ]
     graph = build_graph(posed, poses, sequence, closed)
     loops = [LoopRecord(i, j, True, "") for i, j, _ in gaps]
     loops += [LoopRecord(i, j, False, "only 3 % of the points correspond") for i, j in rejected]
-    return Evidence(
-        records,
-        registrations,
-        tuple(loops),
-        poses,
-        Optimisation(graph, (1.0, 0.5), settled, parts=parts),
-        seen() if images is None else images,
-        Accuracy()
-        if sigma is None
-        else accuracy_of(GraphCovariances(graph), ObservedErrors(), 1.0),
-        diagonal_m=1.0,
-        has_covariances=sigma is not None,
-        given_loops=frozenset(given),
-        **more,
-    )
+    known = sigma is not None
+    accuracy = accuracy_of(GraphCovariances(graph), ObservedErrors(), 1.0) if known else Accuracy()
+    optimised = Optimisation(graph, (1.0, 0.5), settled, parts=parts)
+    images = seen() if images is None else images
+    found = (records, registrations, tuple(loops), poses, optimised, images, accuracy)
+    more |= {"diagonal_m": 1.0, "has_covariances": known, "given_loops": frozenset(given)}
+    return Evidence(*found, **more)
 
 
 def codes(e: Evidence) -> list[str]:
@@ -142,44 +134,29 @@ def in_components(*others, frames=9, lost=()) -> Evidence:
         images=CrossViewConsistency((), ()),
         components=(first, *others),
     )
-    records = tuple(
-        replace(r, status="lost")
-        if r.index in lost
-        else replace(r, component=number.get(r.index, 0))
-        for r in e.records
-    )
-    kept = [
-        k for k in range(frames) if k not in lost and (k in main or others[number[k] - 1].connected)
-    ]
-    graph = build_graph(
-        kept,
-        e.sequential[kept],
-        [Measured(a, b, STEP, np.eye(6)) for a, b in pairwise(kept) if b == a + 1],
-        [
-            Measured(
-                kept[0],
-                kept[-1],
-                se3.inverse(e.sequential[kept[0]]) @ e.sequential[kept[-1]],
-                np.eye(6),
-            )
-        ]
-        if len(kept) > 1
-        else [],
-    )
+    records = list(e.records)
+    for k, record in enumerate(records):
+        where = {"status": "lost"} if k in lost else {"component": number.get(k, 0)}
+        records[k] = replace(record, **where)
+    posed = [k for k in range(frames) if k not in lost]
+    kept = [k for k in posed if k in main or others[number[k] - 1].connected]
+    steps = [Measured(a, b, STEP, np.eye(6)) for a, b in pairwise(kept) if b == a + 1]
+    ends = (kept[0], kept[-1])
+    closed = [closing(e.sequential, ends, ends)] if len(kept) > 1 else []
+    graph = build_graph(kept, e.sequential[kept], steps, closed)
     optimisation = replace(e.optimisation, graph=graph)
-    return replace(e, records=records, sequential=e.sequential[kept], optimisation=optimisation)
+    changes = {"sequential": e.sequential[kept], "optimisation": optimisation}
+    return replace(e, records=tuple(records), **changes)
 
 
-CHANGED = Refinement(
-    np.zeros((9, 4, 4)),
-    True,
-    9,
-    20,
-    calibration_check=CalibrationCheck(
-        motion={"focal": (3.0, 0.2)}, range_change=RangeChange(0.05, 0.001, 4, 5.0)
-    ),
-)
 UNDETERMINED = CalibrationCheck(motion={"focal": (3.0, 0.2)})
+RANGE_CHANGES = replace(UNDETERMINED, range_change=RangeChange(0.05, 0.001, 4, 5.0))
+
+
+def refined_with(check: CalibrationCheck) -> Refinement:
+    return Refinement(np.zeros((9, 4, 4)), True, 9, 20, calibration_check=check)
+
+
 CASES = {
     "few_poses": evidence(("tracked",) + ("lost",) * 7 + ("tracked",)),
     "images_disagree": evidence(images=seen(0.2, near_share=0.9)),
@@ -191,9 +168,7 @@ CASES = {
     "uncertain_poses": evidence(gaps=(), sigma=(0.02, 0.001)),
     "calibration_alarm": evidence(gaps=((0, 8, [0.05, 0, 0, 0, 0, 0]),), sigma=(0.001, 0.001)),
     "unchecked_calibration": evidence(
-        gaps=(),
-        sigma=(0.001, 0.001),
-        refinement=Refinement(np.zeros((9, 4, 4)), True, 9, 20, calibration_check=UNDETERMINED),
+        gaps=(), sigma=(0.001, 0.001), refinement=refined_with(UNDETERMINED)
     ),
     "not_improved": evidence(parts=(GraphPart(0, 9, 9, 1.0, 1.0, True),)),
     "not_refined": evidence(refinement=Refinement(np.zeros((9, 4, 4)), views=9, pairs=20)),
@@ -225,7 +200,7 @@ CASES = {
     "unstable_depth": evidence(moving=((3, 0.1), (4, 0.234), (6, 0.0))),
     "open_motion": evidence(moving=((3, 0.1), (4, 0.26)), moved=(4,)),
     "ambiguous_steps": replace(evidence(), ambiguous=(2, 5)),
-    "range_changes": replace(evidence(sigma=(0.0001, 0.0001)), refinement=CHANGED),
+    "range_changes": evidence(sigma=(0.0001, 0.0001), refinement=refined_with(RANGE_CHANGES)),
     "doubtful_poses": evidence(doubtful=(2, 3, 6)),
 }
 
@@ -374,9 +349,8 @@ def test_excess_distance_of_far_views_counts_in_accuracy() -> None:
 
 
 def test_inconsistent_views_are_named() -> None:
-    pairs = tuple(
-        pair(i, j, 0.2 if 6 in (i, j) else 0.99) for i in range(9) for j in range(i + 1, 9)
-    )
+    ends = [(i, j) for i in range(9) for j in range(i + 1, 9)]
+    pairs = tuple(pair(i, j, 0.2 if 6 in (i, j) else 0.99) for i, j in ends)
     (reason,) = judge(evidence(images=CrossViewConsistency(tuple(range(0, 18, 2)), pairs)))[1]
     assert (reason.code, reason.ranges) == ("images_differ", ((12, 12),))
     assert reason.text.startswith("Frame 12 is inconsistent with most overlapping frames.")
@@ -465,11 +439,8 @@ def test_disconnected_parts_are_named() -> None:
     loose = replace(measured, accuracy=Accuracy(assessed=True, unbounded=(5, 6, 7, 8)))
     assert "bridged_gap" in codes(loose)
     (hanging,) = judge(CASES["single_link"])[1]
-    text = (
-        "Frames 5-8 are connected to the rest by a single registration, which no other view "
-        "confirms."
-    )
-    assert (hanging.text, hanging.ranges) == (text, ((5, 8),))
+    text = "Frames 5-8 are connected to the rest by a single registration, which no other view "
+    assert (hanging.text, hanging.ranges) == (text + "confirms.", ((5, 8),))
 
 
 def test_parts_of_several_ranges_with_lost_frames() -> None:
@@ -511,14 +482,12 @@ def test_component_that_starts_elsewhere_is_no_jump() -> None:
 
 def test_calibration_without_loop_confirmation_is_noted() -> None:
     """Only a note: the factory calibration of a camera is usually right."""
-    found = CalibrationCheck(
-        False, {"focal": -0.05}, support=(0.8, 0.85), estimates={"focal": (-0.05, 0.003)}
-    )
-    refinement = Refinement(np.zeros((9, 4, 4)), True, 9, 20, calibration_check=found)
+    estimates = {"focal": (-0.05, 0.003)}
+    found = CalibrationCheck(False, {"focal": -0.05}, support=(0.8, 0.85), estimates=estimates)
 
     def warnings_of(suspicion: CalibrationCheck, **more: Any) -> list[str]:
-        checked = replace(refinement, calibration_check=suspicion)
-        case = evidence(gaps=(), sigma=(0.001, 0.001), refinement=checked, **more)
+        more |= {"gaps": (), "sigma": (0.001, 0.001)}
+        case = evidence(refinement=refined_with(suspicion), **more)
         return [r.text for r in judge(case)[1] if r.code == "unchecked_calibration"]
 
     (text,) = warnings_of(found)

@@ -13,10 +13,11 @@ from typing import NoReturn
 import pytest
 
 from made_results import contents, result, torn
+from refused import refused
 from tofuse.apps.results.folders import OutputFolder, check_output, finish_interrupted, is_result
 from tofuse.apps.results.output import write_result
 from tofuse.apps.results.run_json import read_run_json
-from tofuse.engine.errors import InputError, OutputError
+from tofuse.engine.errors import OutputError
 from tofuse.formats.files import staging
 from tofuse.formats.files.staging import beside
 from tofuse.lab.demo import _check_simulated
@@ -95,8 +96,7 @@ def test_second_run_is_refused_and_names_first(tmp_path, end) -> None:
     with OutputFolder(out) as mine:
         assert mine.path == out
         assert f"pid {os.getpid()}" in beside(out, "lock").read_text()
-        with pytest.raises(OutputError, match="another process"):
-            OutputFolder(out)
+        refused("another process", out, by=OutputFolder, error=OutputError)
     assert not list(tmp_path.glob(".tofuse-*"))
 
 
@@ -158,8 +158,7 @@ def test_reader_names_process_that_replaces_result(tmp_path, monkeypatch) -> Non
     out.mkdir()
     with OutputFolder(out, overwrite=True):  # finishes it
         shutil.move(out, beside(out, "old"))
-        with pytest.raises(InputError, match=f"another process .pid {os.getpid()}"):
-            finish_interrupted(out)
+        refused(f"another process .pid {os.getpid()}", out, by=finish_interrupted)
         shutil.move(beside(out, "old"), out)
 
 
@@ -169,8 +168,7 @@ def test_current_folder_is_not_replaced(tmp_path, monkeypatch, where) -> None:
     monkeypatch.chdir(tmp_path / where)
     with pytest.raises(OutputError, match="is or contains the current folder"):
         OutputFolder(os.path.relpath(tmp_path / "out"))
-    with pytest.raises(OutputError, match="is or contains the current folder"):
-        OutputFolder("/")
+    refused("is or contains the current folder", "/", by=OutputFolder, error=OutputError)
     assert OutputFolder("new").folder == tmp_path / where / "new"
 
 
@@ -215,8 +213,7 @@ def test_demo_does_not_replace_recording_with_foreign_files(tmp_path, theirs) ->
         (recording / "depth" / "000001.png").symlink_to("elsewhere")
     else:
         (recording / theirs).write_text("mine")
-    with pytest.raises(OutputError, match="or holds something else"):
-        _check_simulated(recording)
+    refused("or holds something else", recording, by=_check_simulated, error=OutputError)
 
 
 def test_refused_process_leaves_the_folder_that_the_other_one_creates(
@@ -229,6 +226,5 @@ def test_refused_process_leaves_the_folder_that_the_other_one_creates(
         raise OutputError("is being written by another process")
 
     monkeypatch.setattr(staging, "Claim", taken)
-    with pytest.raises(OutputError, match="another process"):
-        OutputFolder(folder)
+    refused("another process", folder, by=OutputFolder, error=OutputError)
     assert folder.is_dir()

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from made_results import contents, result, torn
+from refused import refused
 from tofuse.apps.export.exporting import export
 from tofuse.apps.jobs.running import exit_status
 from tofuse.apps.results import output
@@ -19,7 +20,7 @@ from tofuse.apps.results.folders import OutputFolder, check_result, component_nu
 from tofuse.apps.results.loading import load_result
 from tofuse.apps.results.output import write_result
 from tofuse.apps.results.run_json import frames_in_main_model, read_run_json
-from tofuse.engine.errors import InputError, OutputError
+from tofuse.engine.errors import OutputError
 from tofuse.engine.results.types import FrameRecord
 from tofuse.formats.files.staging import beside
 from tofuse.formats.geometry.pcd import read_pcd
@@ -82,10 +83,8 @@ def test_foreign_folder_is_unchanged(tmp_path, name, overwrite) -> None:
 def test_file_as_folder_or_parent_is_refused(tmp_path) -> None:
     file = tmp_path / "file"
     file.write_text("mine")
-    with pytest.raises(OutputError, match="is a file; choose a folder"):
-        OutputFolder(file)
-    with pytest.raises(OutputError, match="can't be written"):
-        OutputFolder(file / "below")
+    refused("is a file; choose a folder", file, by=OutputFolder, error=OutputError)
+    refused("can't be written", file / "below", by=OutputFolder, error=OutputError)
     assert file.read_text() == "mine"
 
 
@@ -136,8 +135,7 @@ def test_failure_while_moving_is_rolled_back_and_keeps_new_result(tmp_path, monk
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", fail)
         words = r"can.t be written .permission denied.*; move the new result, .* from .*tofuse-new-"
-        with pytest.raises(OutputError, match=words):
-            write_result(torn(seed=1), folder)
+        refused(words, torn(seed=1), folder, by=write_result, error=OutputError)
     assert contents(out) == before
     assert set(contents(new)) == BOTH
     assert read_run_json(new / "run.json")["seed"] == 1
@@ -158,14 +156,8 @@ def test_run_json_matches_contract(tmp_path) -> None:
     )
     assert data["schema"] == 1
     assert data["input"] == {"path": "/somewhere", "format": "native", "frames": 2, "opening": None}
-    assert data["reasons"] == [
-        {
-            "code": "lost_frames",
-            "frames": [1, 1],
-            "ranges": [[1, 1]],
-            "text": "Frame 1 has no pose.",
-        }
-    ]
+    reason = {"code": "lost_frames", "frames": [1, 1], "ranges": [[1, 1]]}
+    assert data["reasons"] == [reason | {"text": "Frame 1 has no pose."}]
     assert data["components"] == []
     assert [frame["component"] for frame in data["frames"]] == [None, None]
     assert data["frames"][0]["covariance"] == np.eye(6).ravel().tolist()
@@ -252,10 +244,9 @@ def test_folder_with_foreign_files_is_kept(tmp_path, name, when) -> None:
     before = contents(out)
     if when == "before":
         folder.discard()
-    with pytest.raises(OutputError, match=rf"out/{name}: is not a file of an earlier result; move"):
-        write_result(
-            torn(seed=1), OutputFolder(out, overwrite=True) if when == "before" else folder
-        )
+    says = rf"out/{name}: is not a file of an earlier result; move"
+    with pytest.raises(OutputError, match=says):
+        write_result(torn(1), OutputFolder(out, overwrite=True) if when == "before" else folder)
     assert contents(out) == before
 
 
@@ -271,12 +262,8 @@ def test_folder_with_foreign_files_is_kept(tmp_path, name, when) -> None:
 def test_invalid_run_json(tmp_path, text, message) -> None:
     file = tmp_path / "run.json"
     file.write_text(text, encoding="latin-1")
-    with pytest.raises(InputError, match=message):
-        read_run_json(file)
+    refused(message, file, by=read_run_json)
     assert not is_result(tmp_path)
-    with pytest.raises(InputError, match=r"run\.json: is damaged, or not a run\.json of tofuse"):
-        check_result(tmp_path)
-    with pytest.raises(InputError, match="doesn't exist"):
-        read_run_json(tmp_path / "none.json")
-    with pytest.raises(InputError, match="is a folder"):
-        read_run_json(tmp_path)
+    refused(r"run\.json: is damaged, or not a run\.json of tofuse", tmp_path, by=check_result)
+    refused("doesn't exist", tmp_path / "none.json", by=read_run_json)
+    refused("is a folder", tmp_path, by=read_run_json)

@@ -1,5 +1,6 @@
 """A moving rig: from the trajectories of the cameras to the rig and back."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -93,12 +94,8 @@ def test_each_instant_of_moving_rig_has_one_pose() -> None:
     truth = np.stack([path(t) for t in found.times])
     assert pose_error(found.poses, se3.inverse(truth[0]) @ truth)[0] < 0.003
     # The clocks are independent: each image has its own time.
-    images = np.stack(
-        [
-            path(t) @ (mounted() if camera else np.eye(4))
-            for t, camera in zip(recording.timestamps, source.camera, strict=True)
-        ]
-    )
+    mount, seen = (np.eye(4), mounted()), zip(recording.timestamps, source.camera, strict=True)
+    images = np.stack([path(t) @ mount[camera] for t, camera in seen])
     assert_near(found.result.trajectory, se3.inverse(truth[0]) @ images, 0.003, 0.1)
     between = se3.inverse(found.result.trajectory[::2]) @ found.result.trajectory[1::2]
     strayed = pose_error(between, rig.cameras[1].T_rig_camera)
@@ -121,20 +118,13 @@ def test_views_of_all_cameras_refine_path_of_rig() -> None:
     truth = np.stack([path(t) for t in recording.timestamps[::2]])
     truth = se3.inverse(truth[0]) @ truth
     drift = np.linspace(0, 1, len(truth))[:, None] * [0.01, -0.01, 0.005, 0.003, -0.004, 0.002]
-    T_rig_frame = se3.inverse(truth[of_rig]) @ np.stack(
-        [
-            se3.inverse(path(recording.timestamps[0]))
-            @ path(t)
-            @ (mounted() if k % 2 else np.eye(4))
-            for k, t in enumerate(recording.timestamps)
-        ]
-    )
+    mount = (np.eye(4), mounted())
+    images = np.stack([path(t) @ mount[k % 2] for k, t in enumerate(recording.timestamps)])
+    T_rig_frame = se3.inverse(truth[of_rig]) @ se3.inverse(images[0]) @ images
     start = truth @ se3.exp(drift)
     found = refined(cameras(), recording, start, T_rig_frame, of_rig)
-    before, after = (
-        np.linalg.norm((se3.inverse(truth) @ poses)[:, :3, 3], axis=1)
-        for poses in (start, found.poses)
-    )
+    off = (se3.inverse(truth) @ poses for poses in (start, found.poses))
+    before, after = (np.linalg.norm(T[:, :3, 3], axis=1) for T in off)
     assert before.max() > 0.014
     assert after.max() < 0.3 * before.max()
     (ends,) = found.disagreement
@@ -236,10 +226,7 @@ def test_registered_views_decide_what_the_motion_leaves_open() -> None:
     assert_near(_common_world(rig, tracks, 1, open_fit).T_a_b, mount, 0.02, 0.5)
     certain = HandEye(mount, 1e-6 * np.eye(6), mount, 0.0, 0.01)
     assert _common_world(rig, tracks, 1, certain) is certain
-    elsewhere = [
-        RangeFrame(f.index, f.timestamp, lens, np.full_like(f.depth, 30.0))
-        for f in rig[1].recording
-    ]
+    elsewhere = [replace(f, depth=np.full_like(f.depth, 30.0)) for f in rig[1].recording]
     rig[1] = Camera("cam1", Recording.of(ArraySource(elsewhere), "cam1", "array"))
     with pytest.raises(RegistrationError, match="rotate the rig about two axes"):
         _common_world(rig, tracks, 1, open_fit)

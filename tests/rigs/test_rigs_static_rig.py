@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from pose_errors import assert_near
+from refused import refused
 from rig_room import ROOM
 from rig_scene import CAMERA, looked_at
 from tofuse.apps.rigs.calibrating import calibrate_cameras
 from tofuse.apps.rigs.inputs import Calibration, Camera
 from tofuse.apps.rigs.static_rig import minimum_cost_lag
-from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.lab.simulation.rig import camera_ring, relative
@@ -72,8 +72,7 @@ def test_clocks_are_aligned_by_motion_and_all_instants_are_used() -> None:
 
 
 def test_clocks_not_determined_by_motion_are_refused() -> None:
-    with pytest.raises(InputError, match="no motion that both see determines the offset"):
-        calibrated(100.0, sideways)
+    refused("no motion that both see determines the offset", 100.0, sideways, by=calibrated)
 
 
 def costs_at(lags: np.ndarray, noise: float, motion: Callable[[np.ndarray], np.ndarray], seed: int):
