@@ -1,6 +1,6 @@
 """Loop closures: registrations of views that are far apart in time but show the same place.
 
-A `LoopDetector` (`Revisits` for images, `Nearby` for clouds) starts `Loops`, which are given
+A `LoopDetector` (`Revisits` for images, `Overlapping` for clouds) starts `Loops`, which are given
 views and return `ClosedLoop`s, accepted or rejected with a reason. `Joining` connects a
 `TrackedComponent` to others that were tracked separately, and returns each connected `Group` with
 its `Join`s.
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from tofuse.engine.loops.loops import ClosedLoop, Confirmation, LoopDetector, Loops, PriorLoop
     from tofuse.engine.loops.merged_components import Join, JoinKind, TrackedComponent, cut_edges
     from tofuse.engine.loops.nearby import Nearby
+    from tofuse.engine.loops.overlapping import Overlapping
     from tofuse.engine.loops.revisits import Revisits, degraded_neighbours
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

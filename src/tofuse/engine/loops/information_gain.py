@@ -14,7 +14,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 
 # Approximate accuracy of a loop, m.
-_LOOP_SIGMA_M = 0.02
+LOOP_SIGMA_M = 0.02
 # Maximum number of distinct positions: successive views share one if there are more.
 _MAX_POSITIONS = 1000
 
@@ -44,10 +44,10 @@ class InformationGain:
         """
         a, b, C = self._of_view[i], self._of_view[j], self._C
         relative = np.maximum(C[a, a] + C[b, b] - 2 * C[a, b], 0)
-        return np.asarray(np.round(0.5 * np.log2(1 + relative / _LOOP_SIGMA_M**2)), np.float64)
+        return np.asarray(np.round(0.5 * np.log2(1 + relative / LOOP_SIGMA_M**2)), np.float64)
 
     def add(self, i: int, j: int) -> None:
         """Condition the covariance on a loop between views i and j."""
         a, b = self._of_view[[i, j]]
         u = self._C[:, a] - self._C[:, b]
-        self._C -= np.outer(u, u / (u[a] - u[b] + _LOOP_SIGMA_M**2))
+        self._C -= np.outer(u, u / (u[a] - u[b] + LOOP_SIGMA_M**2))

@@ -12,7 +12,7 @@ from tofuse.engine.filters import Confidence, NeighbourFraction, NeighbourhoodAn
 from tofuse.engine.fusion import Fusion
 from tofuse.engine.graph import castellani, external_sensors, levenberg
 from tofuse.engine.icp import algorithm_1
-from tofuse.engine.loops import Confirmation, Nearby, Revisits
+from tofuse.engine.loops import Confirmation, Nearby, Overlapping, Revisits
 from tofuse.engine.mapping.config import Config, ViewKind, changed, checked
 from tofuse.engine.refinement import Joint, plane_refinement
 from tofuse.engine.sensor import Multipath, Noise, Wrapped
@@ -58,13 +58,7 @@ def default(kind: ViewKind) -> Config:
             base,
             filters=(),  # the density of a cloud's points shows its viewpoint
             odometry=Pairwise(),
-            loops=Nearby(
-                max_distance_m=1.5,
-                max_yaw_rad=0.8,
-                min_gap=30,
-                per_frame=6,
-                confirmation=Confirmation(registrations=(AnyPair(),)),
-            ),
+            loops=Overlapping(confirmation=Confirmation(registrations=(AnyPair(),))),
             refinement=plane_refinement.Planes(),
         )
     return replace(

@@ -466,7 +466,7 @@ def _scene(e: Evidence) -> Iterator[Reason]:
         text = (
             f"The registration of {frame_ranges.in_words(doubtful)} is probable, but not accepted."
         )
-        yield Reason("doubtful_poses", doubtful, text)
+        yield Reason("weak_registration", doubtful, text)
     elif doubtful:
         description = (
             "fitted its keyframe worse than this camera's views usually do; look at it first."

@@ -26,7 +26,10 @@ REASONS: dict[str, tuple[str, str]] = {
     ),
     "repeated_images": ("degraded", "Images are identical to the preceding one."),
     "implausible_depth": ("degraded", "Depths are implausible for this camera."),
-    "weak_registration": ("degraded", "Frames have too few correspondences."),
+    "weak_registration": (
+        "degraded",
+        "Frames have too few correspondences, or their registration was not accepted.",
+    ),
     "not_converged": ("degraded", "Registrations stopped before they converged."),
     "rig_changed": ("degraded", "A camera of the rig has moved from its pose in rig.json."),
     "uncertain_rig": ("degraded", "The pose errors of the rig's cameras may exceed the tolerance."),
