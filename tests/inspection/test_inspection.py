@@ -112,6 +112,13 @@ def test_wrong_unit_is_detected(z) -> None:
         assert f"{z:.2g}"[:1] in warning
 
 
+def test_scans_of_small_objects_are_plausible() -> None:
+    """A scanner's object has 0.1 m about the origin; no ToF camera measures as near."""
+    for frame, codes in ((CloudFrame.of(image(0.05).points), []), (image(0.05), ["depth_unit"])):
+        found = inspect_recording(of([frame])).findings
+        assert [f.code for f in found if f.code == "depth_unit"] == codes
+
+
 def test_clouds_in_different_units_are_detected() -> None:
     def clouds(*factors: float) -> Recording:
         points = image(2.0).points

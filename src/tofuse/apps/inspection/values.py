@@ -17,7 +17,7 @@ from tofuse.engine.sensor import Unwrap, on_surface
 
 # Range of typical distances of ToF cameras, m.
 _MIN_DISTANCE_M, _MAX_DISTANCE_M = 0.15, 12.0
-_MAX_SCAN_M = 1000.0  # of laser scanners
+_MIN_SCAN_M, _MAX_SCAN_M = 0.005, 1000.0  # of scanners, of small objects and from the air
 _MIN_VALID, _MAX_SATURATED = 0.1, 0.05
 # At an edge the surfaces _REACH pixels to both sides differ by the fraction _MIN_STEP of the depth,
 # and each changes by less than the fraction _MAX_CHANGE of that difference over two pixels; flying
@@ -89,8 +89,8 @@ def check_unit(sample: Sample) -> Iterator[Finding]:
         problem = f"but the ambiguity range of this camera is {period:.3g} m"
     elif median > (_MAX_DISTANCE_M if sample.images else _MAX_SCAN_M):
         problem = f"farther than {'ToF cameras' if sample.images else 'scanners'} measure"
-    elif median < _MIN_DISTANCE_M:
-        problem = "nearer than ToF cameras measure"
+    elif median < (_MIN_DISTANCE_M if sample.images else _MIN_SCAN_M):
+        problem = f"nearer than {'ToF cameras' if sample.images else 'scanners'} measure"
     else:
         return
     # The power of ten by which the distance is nearest to 2 m.

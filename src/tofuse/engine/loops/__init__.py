@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING
 from tofuse._faces import face
 
 if TYPE_CHECKING:
-    from tofuse.engine.loops import locating
+    from tofuse.engine.loops import locating, revisits
     from tofuse.engine.loops.joining import Group, Joining
     from tofuse.engine.loops.loops import ClosedLoop, Confirmation, LoopDetector, Loops, PriorLoop
     from tofuse.engine.loops.merged_components import Join, JoinKind, TrackedComponent, cut_edges
     from tofuse.engine.loops.nearby import Nearby
     from tofuse.engine.loops.overlapping import Overlapping
-    from tofuse.engine.loops.revisits import Revisits, degraded_neighbours
 
 __getattr__, __dir__, __all__ = face(__name__, __file__)

@@ -20,7 +20,7 @@ from tofuse.engine.graph import (
     external_sensors,
     graph_covariances,
 )
-from tofuse.engine.loops import ClosedLoop, Join, PriorLoop, degraded_neighbours
+from tofuse.engine.loops import ClosedLoop, Join, PriorLoop, revisits
 from tofuse.engine.mapping.assessment import Assessment
 from tofuse.engine.mapping.color_frames import ColorFrames
 from tofuse.engine.mapping.config import Config
@@ -155,7 +155,7 @@ class BackEnd:
             views = self._observations.views.of(row_of) if suspects else []
             rows = [row_of[v.index] for v in views]
             before, after = graph.poses[rows], optimisation.graph.poses[rows]
-            worse_pairs = degraded_neighbours(views, before, after, suspects)
+            worse_pairs = revisits.degraded_neighbours(views, before, after, suspects)
             cleared = suspects.intersection(k for i, j in worse_pairs for k in range(i + 1, j + 1))
             if not cleared:
                 return optimisation, confirmed

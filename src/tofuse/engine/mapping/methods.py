@@ -12,7 +12,7 @@ from tofuse.engine.filters import Confidence, NeighbourFraction, NeighbourhoodAn
 from tofuse.engine.fusion import Fusion
 from tofuse.engine.graph import castellani, external_sensors, levenberg
 from tofuse.engine.icp import algorithm_1
-from tofuse.engine.loops import Confirmation, Nearby, Overlapping, Revisits
+from tofuse.engine.loops import Confirmation, Nearby, Overlapping, revisits
 from tofuse.engine.mapping.config import Config, ViewKind, changed, checked
 from tofuse.engine.refinement import Joint, plane_refinement
 from tofuse.engine.sensor import Multipath, Noise, Wrapped
@@ -68,7 +68,7 @@ def default(kind: ViewKind) -> Config:
         filters=(Confidence(minimum=1),),
         model_filters=(Wrapped(), Confidence(minimum=3), NeighbourhoodAngle()),
         odometry=Keyframes(),
-        loops=Revisits(),
+        loops=revisits.Revisits(),
         # Not for clouds: it relies on the covariance of registrations, and ICP's is too small.
         optimiser=levenberg.LevenbergMarquardt(),
         refinement=Joint(),
