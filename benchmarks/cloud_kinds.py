@@ -332,8 +332,8 @@ def _apart(points: Float64, rng: np.random.Generator) -> Pair:
     return Pair(points[far], points[~far], None)
 
 
-def _dragon(data: Path, max_pairs: int, _rng: np.random.Generator) -> Iterator[Pair]:
-    """Range scans of a turning dragon of 0.2 m, 24 to 96 degrees apart; some show its back."""
+def dragon_scans(data: Path) -> list[tuple[Float64, Float64]]:
+    """Return the poses (4, 4) and points of scans of a dragon that turns once, 24 degrees apart."""
     folder = _folder(data, "stanford_dragon")
     scans, poses = np.load(folder / "scans.npz"), {}
     for line in (folder / "dragonStandRight.conf").read_text().splitlines():
@@ -344,14 +344,18 @@ def _dragon(data: Path, max_pairs: int, _rng: np.random.Generator) -> Iterator[P
             T[:3, 3] = [float(w) for w in words[1:4]]
             poses[int(words[0].removesuffix(".ply").split("_")[-1])] = T
     found = {int(name.split("_")[-1]): scans[name].astype(float) for name in scans.files}
-    angles = sorted(poses)
+    return [(poses[angle], found[angle]) for angle in sorted(poses)]
+
+
+def _dragon(data: Path, max_pairs: int, _rng: np.random.Generator) -> Iterator[Pair]:
+    """Range scans of a turning dragon of 0.2 m, 24 to 96 degrees apart; some show its back."""
+    scans = dragon_scans(data)
     for apart in (1, 2, 3, 4):
-        for k in np.linspace(0, len(angles) - 1, max_pairs).astype(int):
-            i, j = angles[k], angles[(k + apart) % len(angles)]
-            T = se3.inverse(poses[i]) @ poses[j]
-            yield Pair(found[j], found[i], T, scene=f"{24 * apart} degrees")
-    for k in range(0, len(angles) // 2, 2):
-        yield Pair(found[angles[k]], found[angles[k + len(angles) // 2]], None)
+        for k in np.linspace(0, len(scans) - 1, max_pairs).astype(int):
+            (T_i, target), (T_j, source) = scans[k], scans[(k + apart) % len(scans)]
+            yield Pair(source, target, se3.inverse(T_i) @ T_j, scene=f"{24 * apart} degrees")
+    for k in range(0, len(scans) // 2, 2):
+        yield Pair(scans[k][1], scans[k + len(scans) // 2][1], None)
 
 
 def _dragon_spoilt(data: Path, max_pairs: int, rng: np.random.Generator) -> Iterator[Pair]:
