@@ -161,7 +161,7 @@ def _bags() -> dict[str, Subject]:
 
             path.mkdir()
             bag = bags.Bag(path, kind)
-            bags.depth_bag(bag)
+            bag.depth(count=3)
             bag.info("/camera/color/camera_info", D=(), lens=bags.RGB_LENS)
             for part, T in (("depth", bags.T_RIG_DEPTH), ("color", bags.T_RIG_COLOR)):
                 bag.tf("/tf_static", 9.0, "rig", part, T)
@@ -211,13 +211,15 @@ def _bag(folder: Path, maker: str) -> str:
 def _possible(
     makers: dict[str, Callable[[Path], Any]], inside: Callable[[str], str]
 ) -> dict[str, Subject]:
+    from tofuse.engine.errors import TofuseError
+
     found = {}
     for name, make in makers.items():
         subject = Subject(_in(make, inside(name)), _recording(inside(name), None))
         with tempfile.TemporaryDirectory() as folder:
             try:
                 subject.make(Path(folder))
-            except Exception:  # a package is missing
+            except (ImportError, TofuseError):  # a package is missing
                 continue
         found[name] = subject
     return found
