@@ -68,6 +68,19 @@ def test_path_that_does_not_return_has_no_candidates():
     assert registrar.tried == []
 
 
+@pytest.mark.parametrize("first", range(0, 20, 3))
+@pytest.mark.parametrize("steps", [6, 7])
+def test_loops_span_seven_steps_wherever_they_are(first, steps):
+    """Only two of the views are at the same place."""
+    [cloud, *_], _ = turntable()
+    views = [replace(cloud, index=k) for k in range(30)]
+    places = {k: first if k == first + steps else k for k in range(30)}
+    poses = {k: se3.translation([10.0 * place, 0, 0]) for k, place in places.items()}
+    registrar = Scripted(believes=True)
+    closed(registrar, views, poses)
+    assert registrar.tried == ([(first, first + steps)] if steps == 7 else [])
+
+
 def test_rejected_candidates_are_few():
     registrar = Scripted(believes=False)
     loops = closed(registrar, *turntable())

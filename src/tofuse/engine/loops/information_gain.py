@@ -14,7 +14,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64, Intp
 
 # Approximate accuracy of a loop, m.
-LOOP_SIGMA_M = 0.02
+_LOOP_SIGMA_M = 0.02
 # Maximum number of distinct positions: successive views share one if there are more.
 _MAX_POSITIONS = 1000
 
@@ -26,9 +26,12 @@ class InformationGain:
     ----------
     variance
         (N,) of the positions of views by odometry, m^2, in the order of time.
+    loop_variance
+        That of a loop, in the same unit.
     """
 
-    def __init__(self, variance: Float64) -> None:
+    def __init__(self, variance: Float64, loop_variance: float = _LOOP_SIGMA_M**2) -> None:
+        self._loop_variance = loop_variance
         n = len(variance)
         m = min(n, _MAX_POSITIONS)
         self._of_view = np.arange(n) * m // max(n, 1)
@@ -44,10 +47,10 @@ class InformationGain:
         """
         a, b, C = self._of_view[i], self._of_view[j], self._C
         relative = np.maximum(C[a, a] + C[b, b] - 2 * C[a, b], 0)
-        return np.asarray(np.round(0.5 * np.log2(1 + relative / LOOP_SIGMA_M**2)), np.float64)
+        return np.asarray(np.round(0.5 * np.log2(1 + relative / self._loop_variance)), np.float64)
 
     def add(self, i: int, j: int) -> None:
         """Condition the covariance on a loop between views i and j."""
         a, b = self._of_view[[i, j]]
         u = self._C[:, a] - self._C[:, b]
-        self._C -= np.outer(u, u / (u[a] - u[b] + LOOP_SIGMA_M**2))
+        self._C -= np.outer(u, u / (u[a] - u[b] + self._loop_variance))

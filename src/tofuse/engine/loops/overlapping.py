@@ -14,7 +14,7 @@ from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.frames import Frame, evenly_spaced
 from tofuse.engine.geometry import se3
 from tofuse.engine.icp import extent
-from tofuse.engine.loops.information_gain import LOOP_SIGMA_M, InformationGain
+from tofuse.engine.loops.information_gain import InformationGain
 from tofuse.engine.loops.loops import (
     ClosedLoop,
     Confirmation,
@@ -115,7 +115,8 @@ class _OverlappingLoops(Loops):
             (loop.i, loop.j): close_prior_loop(loop, posed, confirm) for loop in self._prior_loops
         }
         position = {index: k for k, index in enumerate(frames)}
-        gain = InformationGain(np.arange(len(frames), dtype=np.float64) * LOOP_SIGMA_M**2)
+        # Whole numbers of steps, so that the rounded gain of seven does not depend on where.
+        gain = InformationGain(np.arange(len(frames), dtype=np.float64), 1.0)
         for (i, j), given in closed.items():
             if given.record.accepted and i in position and j in position:
                 gain.add(position[i], position[j])
