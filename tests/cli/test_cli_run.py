@@ -106,7 +106,7 @@ def test_run_json_follows_contract(room_result, room_recording) -> None:
     assert data["verdict"] in ("good", "degraded", "failed")
     assert all(isinstance(s, float) and s >= 0 for s in data["seconds"].values())
     for reason in data["reasons"]:
-        assert set(reason) == {"code", "frames", "ranges", "text"}
+        assert set(reason) == {"code", "frames", "ranges", "remedy", "text"}
         assert reason["code"] in REASONS
         assert len(reason["frames"]) == 2
     assert [f["index"] for f in data["frames"]] == list(range(8))

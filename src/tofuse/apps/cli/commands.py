@@ -363,8 +363,8 @@ def _verdict_lines(verdict: str, reasons: Sequence[Reason]) -> list[str]:
     for reason in verdicts.ranked(reasons):
         level = verdicts.REASONS[reason.code][0]
         lines.append(f"  [{VERDICT_COLORS[level]}]{level}:[/] {escaped(reason.text)}")
-        if reason.code in verdicts.ADVICE:
-            lines.append(f"    [dim]{escaped(verdicts.ADVICE[reason.code])}[/]")
+        if remedy := verdicts.remedy(reason):
+            lines.append(f"    [dim]{escaped(remedy)}[/]")
     return lines
 
 

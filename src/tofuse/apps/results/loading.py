@@ -62,7 +62,12 @@ def _reconstruction(folder: Path, run: dict[str, Any]) -> Reconstruction:
     diagnostics = Diagnostics(
         run["verdict"],
         tuple(
-            Reason(r["code"], tuple((a, b) for a, b in r["ranges"]), r["text"])
+            Reason(
+                r["code"],
+                tuple((a, b) for a, b in r["ranges"]),
+                r["text"],
+                r.get("remedy", ""),
+            )
             for r in run["reasons"]
         ),
         frames,

@@ -265,7 +265,7 @@ def _calibration_reason(reason: Reason, worst: int, name: str) -> Reason:
         + " The bound follows from the covariances in rig.json, which include systematic errors "
         "such as multipath."
     )
-    return replace(reason, code="uncertain_rig", text=text)
+    return replace(reason, code="uncertain_rig", text=text, remedy="")
 
 
 def _check_calibration(

@@ -51,13 +51,23 @@ MAX_LISTED = 6
 MIN_SUPPORT, AGREEMENT_RATIO = 0.5, 0.9
 
 
-# What a bound is mostly due to, and what would narrow it.
+# What a bound is mostly due to.
 _CAUSES = {
-    "noise": "noise: more views of the same places would average it",
-    "refinement": "the correction by the refinement: a return to the start would confirm it",
+    "noise": "noise",
+    "refinement": "the correction by the refinement",
     "disagreement": "surfaces that differ between views, by multipath or changes of the scene",
-    "calibration": "the camera's calibration: a better one would remove it",
+    "calibration": "the camera's calibration",
     "range": "ranges that are wrong by different amounts in different places, as by multipath",
+}
+# What would lower the bound, by what most of it is due to; "" for the orientations.
+_REMEDIES = {
+    "": "Return to places seen before, and keep corners and texture in view.",
+    "noise": "Take more views of the same places: they average the noise.",
+    "refinement": "Return to the start: a loop would confirm it.",
+    "disagreement": "Record while nothing moves, and see corners from several sides.",
+    "calibration": "Calibrate the camera (tofuse calibrate depth), or turn it more and return to "
+    "the start.",
+    "range": "See the same places from several distances and sides.",
 }
 
 
@@ -544,11 +554,12 @@ def accuracy_reasons(
         if a.position_m <= tolerance_m:
             error, allowed = _angle(a.rotation_rad), _angle(TOLERANCE_RAD)
         text = f"Pose errors may reach {error} rms (95 % bound); the tolerance is {allowed}."
-        if a.limited_by and a.position_m > tolerance_m:
-            text += f" Most of it is due to {_CAUSES[a.limited_by]}."
+        cause = a.limited_by if a.position_m > tolerance_m else ""
+        if cause:
+            text += f" Most of it is due to {_CAUSES[cause]}."
         if a.worst is not None:
             text += f" Frame {a.worst.frame} is the least certain: {length(a.worst.position_m)}."
-        yield Reason("uncertain_poses", ((frames[0], frames[-1]),), text)
+        yield Reason("uncertain_poses", ((frames[0], frames[-1]),), text, _REMEDIES[cause])
 
 
 def _loop_drift(e: Evidence) -> Iterator[Reason]:

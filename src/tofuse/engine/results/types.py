@@ -34,11 +34,14 @@ class Reason:
         (first, last) frame index of each range that it concerns, ascending; at least one.
     text
         What was found, in one or a few sentences.
+    remedy
+        What to do about it, if that depends on what was found; else see `verdicts.remedy`.
     """
 
     code: str
     ranges: tuple[frame_ranges.Range, ...]
     text: str
+    remedy: str = ""
 
     @property
     def frames(self) -> frame_ranges.Range:

@@ -71,8 +71,8 @@ REASONS: dict[str, tuple[str, str]] = {
     "loop_rejected": ("note", "A loop closure given by the user could not be confirmed."),
 }
 
-# Advice to the user by reason code, where there is any.
-ADVICE: dict[str, str] = {
+# What to do about reasons of a code, where there is anything.
+_REMEDIES: dict[str, str] = {
     "rig_changed": "Recalibrate the rig: tofuse rig calibrate.",
     "uncertain_rig": "Let the fields of view overlap more, or add a camera, and recalibrate.",
     "few_poses": "Record again with smaller steps between frames, or use every frame.",
@@ -93,8 +93,6 @@ ADVICE: dict[str, str] = {
     "open_motion": "Record again with less that moves in view, or from farther away.",
     "ambiguous_steps": "Record at a higher frame rate or move more slowly, and keep things that "
     "don't repeat in view.",
-    "uncertain_poses": "By what the error is mostly due to: return to places seen before, keep "
-    "corners and texture in view, or calibrate the camera (tofuse calibrate depth).",
     "calibration_alarm": "Check the camera's calibration against a known distance and a right "
     "angle.",
     "range_changes": "Let the camera warm up and keep its mode; check the unit of all depth files.",
@@ -119,6 +117,11 @@ def verdict_of(reasons: Iterable[Reason]) -> Verdict:
     return "degraded" if "degraded" in forced else "good"
 
 
+def remedy(reason: Reason) -> str:
+    """Return what to do about a reason, in one or a few sentences; empty if nothing is known."""
+    return reason.remedy or _REMEDIES.get(reason.code, "")
+
+
 def ranked(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
     """Return the reasons, each code once: the most severe first, then those of most frames.
 
@@ -136,6 +139,8 @@ def ranked(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
 def _merged(group: Sequence[Reason]) -> Reason:
     if len(group) == 1:
         return group[0]
-    texts = dict.fromkeys(reason.text for reason in group)
+    texts, remedies = (
+        dict.fromkeys(each) for each in zip(*((r.text, r.remedy) for r in group), strict=True)
+    )
     ranges = frame_ranges.union(r for reason in group for r in reason.ranges)
-    return Reason(group[0].code, ranges, " ".join(texts))
+    return Reason(group[0].code, ranges, " ".join(texts), " ".join(filter(None, remedies)))
