@@ -119,6 +119,18 @@ def test_a_scan_of_an_object_is_planned_from_where_its_camera_was(room_result, m
         planning.expect(replace(result, trajectory=outside), ["sr4000"])
 
 
+def test_coverage_is_by_the_first_frame_that_has_a_pose(room_result) -> None:
+    result = tofuse.load(room_result)
+    model, poses, lost = result.mesh, result.trajectory, 5
+    T = se3.inverse(poses[lost])
+    moved = replace(
+        result,
+        mesh=replace(model, vertices=se3.transform(T, model.vertices).astype(np.float32)),
+        trajectory=np.concatenate([np.full((lost, 4, 4), np.nan), T @ poses[lost:]]),
+    )
+    assert planning._coverage(model, moved, poses) > 0.99
+
+
 @pytest.mark.nightly
 def test_plan_of_the_room(room_result, capsys) -> None:
     status = main(

@@ -147,7 +147,7 @@ def expect(
             Expected(
                 model.name,
                 bound_m,
-                _coverage(scan.mesh, result, path[0]),
+                _coverage(scan.mesh, result, path[0] @ plan.poses),
                 float(result.has_pose.mean()),
                 _decision(bound_m, tolerance_m),
             )
@@ -231,8 +231,11 @@ def _typical_depth(mesh: ScannedMesh, poses: Float64) -> float:
     return float(np.median(np.linalg.norm(some[:, None] - p, axis=2)))
 
 
-def _coverage(mesh: ScannedMesh, result: Reconstruction, T_world_first: Float64) -> float:
-    """Fraction of the area of a mesh near a result's model, whose world is the first camera."""
+def _coverage(mesh: ScannedMesh, result: Reconstruction, poses: Float64) -> float:
+    """Fraction of the area of a mesh near a result's model, by true poses (N, 4, 4) of its frames.
+
+    The world of the model is that of its first frame with a pose.
+    """
     if result.mesh is None or not len(result.mesh.vertices):
         return 0.0
     corners = mesh.vertices.astype(float)[mesh.faces]
@@ -242,7 +245,9 @@ def _coverage(mesh: ScannedMesh, result: Reconstruction, T_world_first: Float64)
     )
     points = corners[which].mean(1)
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
-    model = se3.transform(T_world_first, result.mesh.vertices.astype(float))
+    first = int(result.has_pose.argmax())
+    T_scan_model = poses[first] @ se3.inverse(result.trajectory[first])
+    model = se3.transform(T_scan_model, result.mesh.vertices.astype(float))
     found, _ = KdTree(model).nearest(points, _COVERED * diagonal)
     return float((found >= 0).mean())
 
