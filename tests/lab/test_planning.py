@@ -119,6 +119,25 @@ def test_a_scan_of_an_object_is_planned_from_where_its_camera_was(room_result, m
         planning.expect(replace(result, trajectory=outside), ["sr4000"])
 
 
+def test_poses_of_a_path_may_be_in_any_order(room_result, monkeypatch) -> None:
+    planned = []
+
+    def stopped(_scene, _model, path, times, _depth) -> None:
+        planned.append((path, times))
+        raise NotImplementedError
+
+    monkeypatch.setattr(planning, "_planned", stopped)
+    result = tofuse.load(room_result)
+    order = np.random.default_rng(0).permutation(len(result.trajectory))
+    for rows in (np.arange(len(order)), order):
+        with pytest.raises(NotImplementedError):
+            planning.expect(
+                result, ["sr4000"], poses=result.trajectory[rows], times=result.timestamps[rows]
+            )
+    for ordered, shuffled in zip(*planned, strict=True):
+        np.testing.assert_array_equal(ordered, shuffled)
+
+
 def test_coverage_is_by_the_first_frame_that_has_a_pose(room_result) -> None:
     result = tofuse.load(room_result)
     model, poses, lost = result.mesh, result.trajectory, 5

@@ -114,7 +114,11 @@ def expect(
     known = np.isfinite(poses).all((1, 2))
     if known.sum() < 2:
         raise InputError("has fewer than two poses", where="the path", remedy="use a longer one")
-    path = poses[known]
+    in_order = np.flatnonzero(known)
+    if times is not None:  # files may have poses in any order
+        in_order = in_order[np.argsort(times[in_order], kind="stable")]
+        times = times[in_order]
+    path = poses[in_order]
     diagonal = float(np.linalg.norm(np.ptp(scan.mesh.vertices, axis=0)))
     away = _distance_from(scan.mesh, path)
     if away > diagonal + _distance_from(scan.mesh, scan.trajectory[scan.has_pose]):
@@ -137,8 +141,7 @@ def expect(
     depth_m = _typical_depth(scan.mesh, path)
     expected = []
     for model in models:
-        seconds = None if times is None else times[known]
-        plan = replace(_planned(scene, model, path, seconds, depth_m), effects=effects, seed=seed)
+        plan = replace(_planned(scene, model, path, times, depth_m), effects=effects, seed=seed)
         progress.stage(f"simulating {model.name}", len(plan.raw))
         recording = plan.recording(progress=lambda *_: progress.advance())
         result = reconstructing.reconstruct(recording, threads=threads, progress=progress)
