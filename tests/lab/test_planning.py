@@ -138,6 +138,27 @@ def test_poses_of_a_path_may_be_in_any_order(room_result, monkeypatch) -> None:
         np.testing.assert_array_equal(ordered, shuffled)
 
 
+def test_path_without_times_is_in_the_order_of_its_images(
+    room_result, tmp_path, monkeypatch
+) -> None:
+    """COLMAP and NeRF list images in any order."""
+    axes = np.diag([1.0, -1, -1, 1])
+    frames = [
+        {"file_path": f"{k}.png", "transform_matrix": (se3.translation([k, 0, 0]) @ axes).tolist()}
+        for k in (2, 0, 1)
+    ]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    planned = []
+
+    def stopped(_scan, _cameras, poses, **_) -> None:
+        planned.append(poses[:, 0, 3])
+        raise InputError("stopped")
+
+    monkeypatch.setattr(planning, "expect", stopped)
+    main(["plan", str(room_result), "--path", str(tmp_path / "transforms.json")])
+    np.testing.assert_allclose(planned, [[0, 1, 2]])
+
+
 def test_coverage_is_by_the_first_frame_that_has_a_pose(room_result) -> None:
     result = tofuse.load(room_result)
     model, poses, lost = result.mesh, result.trajectory, 5
