@@ -100,3 +100,16 @@ def test_sgd_solves_connected_parts_separately():
         np.testing.assert_array_equal(found[of_part[0]], graph.poses[0])
         part = graph.with_poses(found[of_part])
         assert part.chi2() < 0.2 * graph.chi2()
+
+
+def test_sgd_moves_nothing_by_edges_without_information():
+    graph = grid(4, 0.03, 0)
+    of_rotation = graph.information.copy()
+    of_rotation[:, :3] = of_rotation[:, :, :3] = 0
+    turned = Stochastic(20).optimise(replace(graph, information=of_rotation)).graph
+    assert turned.chi2() < 0.2 * replace(graph, information=of_rotation).chi2()
+    none = Stochastic(3).optimise(replace(graph, information=0 * of_rotation))
+    np.testing.assert_array_equal(none.graph.poses, graph.poses)
+    assert none.objective[-1] == 0
+    apart = build_graph([3, 5], graph.poses[:2], [])
+    np.testing.assert_array_equal(Stochastic().optimise(apart).graph.poses, apart.poses)
