@@ -387,10 +387,24 @@ def test_places_without_bound_have_no_slope() -> None:
     """Three in a row and one of another region, which has no neighbours there."""
     places = np.array([(0.0, 0, 0), (0.01, 0, 0), (0.02, 0, 0), (0.03, 0, 0)])
     region, deviation = np.array([0, 0, 0, 1]), np.array([0.0, 0.001, 0.002, 0.003])
-    steep = module._gradients(places, region, deviation, np.zeros(4), 0.012)
+    steep = module._gradients(places, region, deviation, np.zeros((4, 4)), 0.012)
     np.testing.assert_allclose(steep, [0.1, 0.1, 0.1, 0], atol=1e-9)
-    unknown = module._gradients(places, region, deviation, np.full(4, np.inf), 0.012)
+    unknown = module._gradients(places, region, deviation, np.full((4, 4), np.inf), 0.012)
     np.testing.assert_array_equal(unknown, 0)
+
+
+def test_slope_is_neither_that_of_noise_nor_less_than_it_is() -> None:
+    """Errors that neighbours share do not change their differences."""
+    u, v = np.mgrid[:9, :9].reshape(2, -1) * 0.01
+    places, region = np.stack([u, v, 0 * u], 1), np.zeros(len(u), np.intp)
+    apart = np.linalg.norm(places[:, None] - places, axis=2)
+    covariance = 0.0005**2 * np.eye(len(u)) + 0.001**2 * np.exp(-apart / 0.1)
+    root, rng = np.linalg.cholesky(covariance), np.random.default_rng(0)
+    found = [
+        module._gradients(places, region, 0.1 * u + root @ noise, covariance, 0.01)
+        for noise in rng.normal(size=(50, len(u)))
+    ]
+    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(0.1, rel=0.05)
 
 
 def test_what_one_view_alone_saw_is_no_change(part) -> None:

@@ -15,7 +15,7 @@ from cli_calls import printed, refuses
 from damaged_files import make_native, make_ply
 from made_recordings import make_sr4000
 from refused import refused
-from tofuse.engine.cameras.cameras import RayTable
+from tofuse.engine.cameras.cameras import Pinhole, RayTable
 from tofuse.engine.errors import InputError, OutputError
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording
@@ -90,6 +90,19 @@ def test_depth_stored_as_floats(tmp_path: Path) -> None:
         path.unlink()
     before = open_recording(folder)
     check_same(before, open_recording(convert(before, tmp_path / "out").folder), depth=6e-5)
+
+
+def test_amplitude_is_of_the_kind_of_frames_that_have_it(tmp_path: Path) -> None:
+    depth, amplitude = np.ones((6, 8), np.float32), np.full((6, 8), 50, np.float32)
+    camera = Pinhole(8, 6, 10.0, 10.0, 3.5, 2.5)
+    frames = [
+        RangeFrame(0, 0.0, camera, depth),
+        RangeFrame(
+            1, 0.1, camera, depth, amplitude_image=amplitude, amplitude_kind="range_compensated"
+        ),
+    ]
+    convert(Recording.of(ArraySource(frames), "made", "made"), tmp_path / "out")
+    assert open_recording(tmp_path / "out")[1].amplitude_kind == "range_compensated"
 
 
 def test_rays_of_each_frame(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +108,22 @@ def test_open3d_is_read_back(tmp_path: Path) -> None:
     assert frame.camera == pinhole_of(BARREL)
     assert np.diff(back.timestamps) == pytest.approx(0.1, abs=1e-5)
     assert np.allclose(back.reference[3][:3, 3], [0.3, 0, 0])
+
+
+@pytest.mark.parametrize("dark", [None, np.zeros((72, 96), np.float32)])
+def test_first_image_may_be_dark(tmp_path: Path, dark: np.ndarray | None) -> None:
+    """Grey levels are those of the first amplitude that there is."""
+    frames = [turned()[k] for k in range(4)]
+    frames[0] = replace(frames[0], amplitude_image=dark)
+    recording = Recording.of(ArraySource(frames), "made", "made")
+    done = convert_to(recording, tmp_path / "out", "tum")
+    assert not any("black" in w for w in done.warnings)
+    back = tofuse.open(tmp_path / "out")
+    assert [back[k].color_image.max() for k in range(2)] == [0, 255]
+    without = [replace(frame, amplitude_image=None) for frame in frames]
+    recording = Recording.of(ArraySource(without), "made", "made")
+    done = convert_to(recording, tmp_path / "black", "tum")
+    assert any("black" in w for w in done.warnings)
 
 
 def test_unsupported_conversions_are_refused(tmp_path: Path) -> None:

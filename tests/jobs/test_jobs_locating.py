@@ -16,6 +16,7 @@ from made_rooms import OTHER, at, seen
 from made_sessions import HERE, recorded
 from refused import refused
 from tofuse.apps.jobs import locating
+from tofuse.apps.pairs import pair_words
 from tofuse.engine.frames.frames import CloudFrame
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
@@ -207,6 +208,24 @@ def test_cloud_is_registered_with_points_of_the_map(session_results, tmp_path, c
     assert status == (0 if frame["accepted"] else 3)
     if frame["accepted"]:
         assert error_m(np.array(frame["T_world_camera"]), AGAIN[0]) < 0.05
+
+
+def test_cloud_in_map_coordinates_is_located_by_a_point_of_it(
+    session_results, tmp_path, capfd
+) -> None:
+    """Where its origin comes to lie, hundreds of kilometres away, says nothing."""
+    shift = np.array([412_000.0, 5_653_000.0, 118.0])
+    points = seen(AGAIN[0], 700).points
+    write_ply(tmp_path / "view.ply", GeometryRecord(points + shift))
+    _, data = locate_json(capfd, session_results["here"], tmp_path / "view.ply")
+    (frame,) = data["frames"]
+    point, T = np.array(frame["reference_point_m"]), np.array(frame["T_world_camera"])
+    assert np.linalg.norm(point - shift) < 10
+    assert frame["sigma_m"] < 0.1
+    (place,) = se3.transform(T, point[None])
+    assert np.linalg.norm(place) < 10
+    call("locate", session_results["here"], tmp_path / "view.ply")
+    assert pair_words.vector(place, 3) in capfd.readouterr().out
 
 
 def test_python_refuses_cloud(here) -> None:

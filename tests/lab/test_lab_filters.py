@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +97,10 @@ def test_mask_is_read_from_image(tmp_path: Path) -> None:
     path = tmp_path / "mask.png"
     cv2.imwrite(str(path), image)
     assert (Mask(str(path)).mask(view, ()) == (image > 0)).all()
+    cv2.imwrite(str(path), 255 - image)
+    os.utime(path, (0, 0))  # another time, however coarse the clock
+    assert (Mask(str(path)).mask(view, ()) == (image < 255)).all()
+    cv2.imwrite(str(path), image)
     cv2.imwrite(str(tmp_path / "color.png"), np.dstack([image, 0 * image, 0 * image]))
     assert (Mask(str(tmp_path / "color.png")).mask(view, ()) == (image > 0)).all()
     cv2.imwrite(str(tmp_path / "small.png"), image[:10])

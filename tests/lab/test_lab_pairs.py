@@ -116,6 +116,27 @@ def test_ls3d_estimates_free_scale_and_its_precision():
         assert free.rms_m < 0.5 * rigid.rms_m
 
 
+def test_ls3d_applies_the_scale_before_the_motion():
+    """As `Registration.scale` says: about the origin, from which the source is metres away."""
+    T, true = small(1, 4), 0.97
+    cloud = bumpy_ball(6000, 1)
+    source = CloudFrame.of(se3.transform(se3.inverse(T), cloud) / true)
+    centre = true * source.points.mean(0)
+    guess = T @ se3.translation(centre - centre / true)
+    found = LeastSquaresMatching(0.02, scale_sigma=1.0).register(
+        source, view(bumpy_ball(6000, 0)), guess, rng()
+    )
+    moved = se3.transform(found.T_target_source, found.scale * source.points)
+    assert np.linalg.norm(moved - cloud, axis=1).max() < 0.002
+    assert found.scale_sigma == found.precision[6] > 0
+    # The distance along the ray is as uncertain as the scale.
+    distance = np.linalg.norm(centre)
+    ray = centre / distance
+    assert found.covariance is not None
+    along = np.sqrt(ray @ found.covariance[:3, :3] @ ray)
+    assert along == pytest.approx(distance * found.scale_sigma, rel=0.2)
+
+
 def test_ls3d_with_intensity_does_not_slide_along_wall():
     """Akca 2007: the intensity is a second surface that constrains what the first does not."""
 

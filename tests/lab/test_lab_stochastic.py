@@ -77,3 +77,39 @@ def test_exact_edges_are_satisfied_in_either_direction():
     slips[0] = np.eye(4)
     found = Stochastic().optimise(turned.with_poses(turned.poses @ slips))
     np.testing.assert_allclose(found.graph.poses, graph.poses, atol=0.1)
+
+
+def test_sgd_solves_connected_parts_separately():
+    """Also if their vertices alternate; the first of each stays."""
+    a, b = grid(4, 0.03, 0), grid(4, 0.03, 1)
+    n, places = len(a.ids), [np.arange(0, 32, 2), np.arange(1, 32, 2)]
+    poses = np.empty((2 * n, 4, 4))
+    for of_part, graph in zip(places, (a, b), strict=True):
+        poses[of_part] = graph.poses
+    both = replace(
+        a,
+        ids=np.arange(2 * n),
+        poses=poses,
+        edges=np.concatenate([places[0][a.edges], places[1][b.edges]]),
+        measurements=np.concatenate([a.measurements, b.measurements]),
+        information=np.concatenate([a.information, b.information]),
+        loop=np.concatenate([a.loop, b.loop]),
+    )
+    found = Stochastic(20).optimise(both).graph.poses
+    for of_part, graph in zip(places, (a, b), strict=True):
+        np.testing.assert_array_equal(found[of_part[0]], graph.poses[0])
+        part = graph.with_poses(found[of_part])
+        assert part.chi2() < 0.2 * graph.chi2()
+
+
+def test_sgd_moves_nothing_by_edges_without_information():
+    graph = grid(4, 0.03, 0)
+    of_rotation = graph.information.copy()
+    of_rotation[:, :3] = of_rotation[:, :, :3] = 0
+    turned = Stochastic(20).optimise(replace(graph, information=of_rotation)).graph
+    assert turned.chi2() < 0.2 * replace(graph, information=of_rotation).chi2()
+    none = Stochastic(3).optimise(replace(graph, information=0 * of_rotation))
+    np.testing.assert_array_equal(none.graph.poses, graph.poses)
+    assert none.objective[-1] == 0
+    apart = build_graph([3, 5], graph.poses[:2], [])
+    np.testing.assert_array_equal(Stochastic().optimise(apart).graph.poses, apart.poses)

@@ -16,7 +16,7 @@ from tofuse.engine.icp.icp_kernels import transform_points
 from tofuse.engine.stored_views.view_store import Spacing, ViewStore
 from tofuse.engine.views.prepared_view import PreparedView
 from tofuse.lab.methods.bergevin import Bergevin
-from tofuse.lab.methods.multiview import Pairs
+from tofuse.lab.methods.multiview import Cloud, Pairs, relax_poses
 from tofuse.lab.methods.pulli import Pulli, distribute_errors
 from tofuse.lab.methods.simultaneous import SmallAngles, WilliamsBennamoun, solve_correspondences
 
@@ -97,6 +97,20 @@ def test_refinement_corrects_drift(method):
     assert found.support[1] > found.support[0]
     np.testing.assert_allclose(found.poses[0], T[0], atol=1e-9)
     assert errors_of(found.poses, T).max() < 0.25 * errors_of(start, T).max()
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_pulli_aligns_a_view_that_sees_a_small_part_of_another(first):
+    """Most points of the larger one have no partner: only the other way counts as a pair."""
+    whole, part = rock(6000, 0), rock(6000, 1)
+    part = part[np.linalg.norm(part - MIDDLE + [0, 0, 0.5], axis=1) < 0.22]
+    T = np.array([np.eye(4), turn([0, 1, 0], 20)])
+    clouds = [Cloud.of(view(p, pose)) for p, pose in zip((whole, part), T, strict=True)]
+    order = [first, 1 - first]
+    start = drifted(T[order])
+    found = relax_poses(Pulli(), [clouds[k] for k in order], start)
+    assert errors_of(start, T[order])[1] > 0.01
+    assert errors_of(found, T[order])[1] < 0.003
 
 
 def test_pulli_distributes_misfit_evenly_over_ring():

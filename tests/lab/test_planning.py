@@ -119,6 +119,58 @@ def test_a_scan_of_an_object_is_planned_from_where_its_camera_was(room_result, m
         planning.expect(replace(result, trajectory=outside), ["sr4000"])
 
 
+def test_poses_of_a_path_may_be_in_any_order(room_result, monkeypatch) -> None:
+    planned = []
+
+    def stopped(_scene, _model, path, times, _depth) -> None:
+        planned.append((path, times))
+        raise NotImplementedError
+
+    monkeypatch.setattr(planning, "_planned", stopped)
+    result = tofuse.load(room_result)
+    order = np.random.default_rng(0).permutation(len(result.trajectory))
+    for rows in (np.arange(len(order)), order):
+        with pytest.raises(NotImplementedError):
+            planning.expect(
+                result, ["sr4000"], poses=result.trajectory[rows], times=result.timestamps[rows]
+            )
+    for ordered, shuffled in zip(*planned, strict=True):
+        np.testing.assert_array_equal(ordered, shuffled)
+
+
+def test_path_without_times_is_in_the_order_of_its_images(
+    room_result, tmp_path, monkeypatch
+) -> None:
+    """COLMAP and NeRF list images in any order."""
+    axes = np.diag([1.0, -1, -1, 1])
+    frames = [
+        {"file_path": f"{k}.png", "transform_matrix": (se3.translation([k, 0, 0]) @ axes).tolist()}
+        for k in (2, 0, 1)
+    ]
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    planned = []
+
+    def stopped(_scan, _cameras, poses, **_) -> None:
+        planned.append(poses[:, 0, 3])
+        raise InputError("stopped")
+
+    monkeypatch.setattr(planning, "expect", stopped)
+    main(["plan", str(room_result), "--path", str(tmp_path / "transforms.json")])
+    np.testing.assert_allclose(planned, [[0, 1, 2]])
+
+
+def test_coverage_is_by_the_first_frame_that_has_a_pose(room_result) -> None:
+    result = tofuse.load(room_result)
+    model, poses, lost = result.mesh, result.trajectory, 5
+    T = se3.inverse(poses[lost])
+    moved = replace(
+        result,
+        mesh=replace(model, vertices=se3.transform(T, model.vertices).astype(np.float32)),
+        trajectory=np.concatenate([np.full((lost, 4, 4), np.nan), T @ poses[lost:]]),
+    )
+    assert planning._coverage(model, moved, poses) > 0.99
+
+
 @pytest.mark.nightly
 def test_plan_of_the_room(room_result, capsys) -> None:
     status = main(

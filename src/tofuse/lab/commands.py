@@ -81,6 +81,8 @@ def plan(arguments: cli.Plan) -> int:
     if arguments.path is not None:
         read = read_poses(arguments.path)
         poses, times = read.poses, read.timestamps
+        if read.frames is not None:
+            poses = poses[read.frames.argsort(kind="stable")]
     with progress_unless_json(arguments) as progress, threads(arguments.threads):
         expected = planning.expect(
             scan,

@@ -114,7 +114,11 @@ def expect(
     known = np.isfinite(poses).all((1, 2))
     if known.sum() < 2:
         raise InputError("has fewer than two poses", where="the path", remedy="use a longer one")
-    path = poses[known]
+    in_order = np.flatnonzero(known)
+    if times is not None:  # files may have poses in any order
+        in_order = in_order[np.argsort(times[in_order], kind="stable")]
+        times = times[in_order]
+    path = poses[in_order]
     diagonal = float(np.linalg.norm(np.ptp(scan.mesh.vertices, axis=0)))
     away = _distance_from(scan.mesh, path)
     if away > diagonal + _distance_from(scan.mesh, scan.trajectory[scan.has_pose]):
@@ -137,8 +141,7 @@ def expect(
     depth_m = _typical_depth(scan.mesh, path)
     expected = []
     for model in models:
-        seconds = None if times is None else times[known]
-        plan = replace(_planned(scene, model, path, seconds, depth_m), effects=effects, seed=seed)
+        plan = replace(_planned(scene, model, path, times, depth_m), effects=effects, seed=seed)
         progress.stage(f"simulating {model.name}", len(plan.raw))
         recording = plan.recording(progress=lambda *_: progress.advance())
         result = reconstructing.reconstruct(recording, threads=threads, progress=progress)
@@ -147,7 +150,7 @@ def expect(
             Expected(
                 model.name,
                 bound_m,
-                _coverage(scan.mesh, result, path[0]),
+                _coverage(scan.mesh, result, path[0] @ plan.poses),
                 float(result.has_pose.mean()),
                 _decision(bound_m, tolerance_m),
             )
@@ -231,8 +234,11 @@ def _typical_depth(mesh: ScannedMesh, poses: Float64) -> float:
     return float(np.median(np.linalg.norm(some[:, None] - p, axis=2)))
 
 
-def _coverage(mesh: ScannedMesh, result: Reconstruction, T_world_first: Float64) -> float:
-    """Fraction of the area of a mesh near a result's model, whose world is the first camera."""
+def _coverage(mesh: ScannedMesh, result: Reconstruction, poses: Float64) -> float:
+    """Fraction of the area of a mesh near a result's model, by true poses (N, 4, 4) of its frames.
+
+    The world of the model is that of its first frame with a pose.
+    """
     if result.mesh is None or not len(result.mesh.vertices):
         return 0.0
     corners = mesh.vertices.astype(float)[mesh.faces]
@@ -242,7 +248,9 @@ def _coverage(mesh: ScannedMesh, result: Reconstruction, T_world_first: Float64)
     )
     points = corners[which].mean(1)
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
-    model = se3.transform(T_world_first, result.mesh.vertices.astype(float))
+    first = int(result.has_pose.argmax())
+    T_scan_model = poses[first] @ se3.inverse(result.trajectory[first])
+    model = se3.transform(T_scan_model, result.mesh.vertices.astype(float))
     found, _ = KdTree(model).nearest(points, _COVERED * diagonal)
     return float((found >= 0).mean())
 

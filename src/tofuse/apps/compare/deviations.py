@@ -310,7 +310,7 @@ def mapped(
     radius = np.zeros(count)
     used = label >= 0
     np.maximum.at(radius, label[used], np.linalg.norm(feet[used] - p[label[used]], axis=1))
-    slope = radius * _gradients(p, region_of, mean, np.diag(covariance), size)
+    slope = radius * _gradients(p, region_of, mean, covariance, size)
     places = Places(p, normal, region_of, n, mean, covariance, np.sqrt(uneven), slope, size)
     of_points = np.full(len(points), np.nan)
     row = np.maximum(label, 0)
@@ -328,11 +328,11 @@ def mapped(
 
 
 def _gradients(
-    p: Float64, region: Intp, deviation: Float64, variance: Float64, size: float
+    p: Float64, region: Intp, deviation: Float64, covariance: Float64, size: float
 ) -> Float64:
     """Return the length (K,) of the gradient of deviations, by neighbouring places of a region.
 
-    It is that in excess of noise.
+    It is that in excess of errors with this covariance (K, K).
     """
     k = min(_NEIGHBOURS, len(p))
     apart = _apart(p, region, 2 * (float(np.ptp(p, axis=0).max()) + size))
@@ -342,10 +342,14 @@ def _gradients(
     rise = np.where(near, deviation[index] - deviation[:, None], 0.0)
     inverse = np.linalg.pinv(np.where(near[..., None], offset, 0.0), rcond=0.3)
     square = (np.einsum("kij,kj->ki", inverse, rise) ** 2).sum(1)
-    gain = (inverse**2).sum((1, 2))
-    # None without neighbours, even where the variance is infinite.
-    noise = np.multiply(2 * variance, gain, out=np.zeros_like(gain), where=gain > 0)
-    return np.asarray(np.sqrt(np.maximum(square - noise, 0.0)))
+    # The covariance of the rises: errors that neighbours share cancel.
+    with np.errstate(invalid="ignore"):
+        to_centre = covariance[index, np.arange(len(p))[:, None]]
+        shared = to_centre[:, :, None] + to_centre[:, None]
+        of_rises = covariance[index[:, :, None], index[:, None]] - shared
+        of_rises += np.diag(covariance)[:, None, None]
+        noise = np.einsum("kij,kjl,kil->k", inverse, of_rises, inverse)
+    return np.asarray(np.sqrt(np.maximum(square - np.nan_to_num(noise, nan=np.inf), 0.0)))
 
 
 class _Sums:

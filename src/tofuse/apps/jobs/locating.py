@@ -7,7 +7,7 @@ poses. The frames of a clip are tracked, and a few of them located together.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -56,12 +56,16 @@ class LocatedFrame:
         Its pose; None if there is none.
     reason
         Why there is none, or it is not accepted; empty otherwise.
+    reference_point
+        (3,) m, about which its pose is perturbed: of a cloud in map coordinates a point of it, else
+        the origin.
     """
 
     index: int
     timestamp: float
     location: locating.Location | None
     reason: str
+    reference_point: Float64 = field(default_factory=lambda: np.zeros(3))
 
     def __repr__(self) -> str:
         place = self.location and np.round(self.location.T_map_camera[:3, 3], 3).tolist()
@@ -90,6 +94,7 @@ class LocatedFrame:
                 "sigma_m": sigma_m,
                 "sigma_rad": sigma_rad,
                 "unobservable": location.unobservable,
+                "reference_point_m": self.reference_point,
                 "probability": location.probability,
                 "runner_up": location.runner_up,
             }
@@ -338,7 +343,8 @@ def _located_cloud(
         "" if registration.believed else registration.reason or "the pose can't be verified",
         registration.runner_up,
     )
-    return _located(pair.source.index, pair.source.frame.timestamp, location)
+    located = _located(pair.source.index, pair.source.frame.timestamp, location)
+    return replace(located, reference_point=registration.reference_point)
 
 
 def sentence(frame: LocatedFrame) -> str:
@@ -348,15 +354,17 @@ def sentence(frame: LocatedFrame) -> str:
     if location is not None:
         T = location.T_map_camera
         rotation = np.degrees(se3.so3_log(T[:3, :3]))
+        (place,) = se3.transform(T, frame.reference_point[None])
         words.append(
-            f"at {pair_words.vector(T[:3, 3], 3)} m, rotation {pair_words.vector(rotation, 1)} deg"
+            f"at {pair_words.vector(place, 3)} m, rotation {pair_words.vector(rotation, 1)} deg"
         )
         sigma_m, sigma_rad = se3.largest_sigmas(location.covariance).tolist()
         if np.isfinite(sigma_m) and not len(location.unobservable):
             words.append(f"sigma {1e3 * sigma_m:.0f} mm, {np.degrees(sigma_rad):.2f} deg")
         words.append(f"probability {probability(location.probability)}")
         if location.runner_up is not None:
-            apart = np.linalg.norm(location.runner_up[:3, 3] - T[:3, 3])
+            other = se3.transform(location.runner_up, frame.reference_point[None])
+            apart = np.linalg.norm(other - place)
             words.append(f"runner-up {apart:.2f} m away")
     return "; ".join([*words, *([frame.reason] if frame.reason else [])])
 

@@ -149,8 +149,9 @@ def _writer(
     if unit is None or not all(_is_counted(f, unit) for f in images):
         farthest = max(float(f.depth.max()) for f in images)
         unit = max(FINEST_UNIT_M, _round_up(1.25 * farthest / depth_counts.MAX_COUNTS))
-    if any(f.amplitude_image is not None for f in images):
-        properties["amplitude_kind"] = first.amplitude_kind
+    kinds = [f.amplitude_kind for f in images if f.amplitude_image is not None]
+    if kinds:
+        properties["amplitude_kind"] = kinds[0]
     return RecordingWriter(
         folder,
         camera,
@@ -282,7 +283,7 @@ def _write_layout(recording: Recording, folder: Path, layout: Layout) -> tuple[i
     warnings: list[str] = []
     color_folder = "rgb" if layout == "tum" else "color"
     rectifier: Rectifier | None = None
-    white = 0.0
+    white, has_color = 0.0, False
     written: list[int] = []
     out_of_range = 0
     for k, item in enumerate(recording.read_all()):
@@ -298,11 +299,10 @@ def _write_layout(recording: Recording, folder: Path, layout: Layout) -> tuple[i
             rectifier = Rectifier(pinhole_of(item.camera))
             if rectifier.pinhole != item.camera:
                 warnings.append("images are rectified: these layouts support only pinhole cameras")
-            if item.color_image is None and item.amplitude_image is None:
-                warnings.append("there is neither colour nor amplitude: colour images are black")
-            elif item.amplitude_image is not None and item.amplitude_image.any():
-                positive = item.amplitude_image[item.amplitude_image > 0]
-                white = float(np.percentile(positive, _WHITE_PERCENTILE))
+        if not white and item.amplitude_image is not None and (item.amplitude_image > 0).any():
+            positive = item.amplitude_image[item.amplitude_image > 0]
+            white = float(np.percentile(positive, _WHITE_PERCENTILE))
+        has_color |= item.color_image is not None
         frame = rectifier(item)
         counts = np.rint(frame.z.astype(float) * COUNTS_PER_M[layout])
         out_of_range += int((counts >= depth_counts.MAX_COUNTS).sum())
@@ -313,6 +313,8 @@ def _write_layout(recording: Recording, folder: Path, layout: Layout) -> tuple[i
         written.append(k)
     if rectifier is None:
         raise InputError("no frame can be read", where=recording.path, remedy="check the recording")
+    if not (white or has_color):
+        warnings.append("there is neither colour nor amplitude: colour images are black")
     if out_of_range:
         farthest = depth_counts.MAX_COUNTS / COUNTS_PER_M[layout]
         warnings.append(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -37,7 +38,8 @@ class Mask(Bounded, Filter):
     def mask(self, frame: Frame, history: Sequence[Frame]) -> Bool:
         """See `Filter.mask`; InputError if the image can't be read, or has another size."""
         assert isinstance(frame, RangeFrame)
-        keep = _read(self.image)
+        modified = os.stat(self.image).st_mtime_ns if os.path.exists(self.image) else 0
+        keep = _read(self.image, modified)
         if keep.shape != frame.depth.shape:
             rows, columns = frame.depth.shape
             raise InputError(
@@ -49,7 +51,8 @@ class Mask(Bounded, Filter):
 
 
 @lru_cache(maxsize=8)
-def _read(path: str) -> Bool:
+def _read(path: str, modified: int) -> Bool:
+    """Return the mask; a file that was modified is read again."""
     try:
         data = np.frombuffer(Path(path).read_bytes(), np.uint8)
     except OSError as error:

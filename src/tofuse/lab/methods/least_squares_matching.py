@@ -26,18 +26,15 @@ _MIN_SIGMA = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class SimilarityMatch(Registration):
-    """A registration that also estimates the scale.
+    """A registration that may also estimate the scale.
 
     Attributes
     ----------
-    scale
-        Scale from source to target; 1 if not estimated.
     precision
         (7,) standard deviations: translation (m), rotation (rad), scale; about the centroid of the
         source's points.
     """
 
-    scale: float = 1.0
     precision: Float64 = field(default_factory=lambda: np.zeros(7))
 
 
@@ -134,6 +131,9 @@ class LeastSquaresMatching(Bounded, Registrar):
             converged = bool(np.abs(step * units).max() < _CONVERGENCE * self.resolution)
         covariance = np.zeros((7, 7))
         covariance[:dof, :dof] = np.linalg.pinv(N[:dof, :dof])
+        sigma = np.sqrt(np.diag(covariance))
+        # The scale applies before T, about the source's origin.
+        T = T @ se3.translation((1 - scale) * centroid)
         return SimilarityMatch(
             T_target_source=T,
             converged=converged,
@@ -142,10 +142,11 @@ class LeastSquaresMatching(Bounded, Registrar):
             points=len(data),
             error=errors[-1],
             rms_m=float(np.sqrt((foot.distance**2).mean())),
-            information=_information_in_source(N[:6, :6], T, centroid),
+            information=_information_in_source(N[:dof, :dof], T, scale * centroid),
             errors=tuple(errors),
             scale=scale,
-            precision=np.sqrt(np.diag(covariance)),
+            scale_sigma=float(sigma[6]) if self.scale_sigma else None,
+            precision=sigma,
         )
 
     def _normal_equations(
@@ -222,9 +223,16 @@ class LeastSquaresMatching(Bounded, Registrar):
 
 
 def _information_in_source(N: Float64, T_target_source: Float64, centroid: Float64) -> Float64:
-    """Convert information (6, 6) about `centroid`, in the target's axes, to `Registration`'s."""
-    J = se3.adjoint(se3.pose(T_target_source[:3, :3]) @ se3.translation(-centroid))
+    """Convert information (6, 6) about `centroid`, in the target's axes, to `Registration`'s.
+
+    Information (7, 7) is also of the scale, which is eliminated.
+    """
+    R = T_target_source[:3, :3]
+    J = np.eye(len(N))
+    J[:6, :6] = se3.adjoint(se3.pose(R) @ se3.translation(-centroid))
+    J[:3, 6:] = (R @ centroid)[:, None]
     H = J.T @ N @ J
+    H = H[:6, :6] - H[:6, 6:] @ np.linalg.pinv(H[6:, 6:]) @ H[6:, :6]
     return np.asarray((H + H.T) / 2)
 
 

@@ -55,8 +55,9 @@ class Pulli(RelaxationMethod):
             stopping=icp_parts.SmallStep(),
         )
         constraints = []
+        ends = {(p.i, p.j) for p in pairs}
         for p in pairs:
-            if p.i > p.j:
+            if p.i > p.j and (p.j, p.i) in ends:
                 continue
             guess = se3.inverse(poses[p.j]) @ poses[p.i]
             try:

@@ -10,7 +10,7 @@ import numpy as np
 from tofuse.engine.arrays import Float64
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.geometry import se3
-from tofuse.engine.graph import Optimisation, Optimiser, PoseGraph, castellani, levenberg
+from tofuse.engine.graph import Optimisation, Optimiser, PoseGraph, levenberg
 from tofuse.engine.parts import part
 
 
@@ -39,18 +39,28 @@ class Stochastic(Bounded, Optimiser):
     def optimise(self, graph: PoseGraph) -> Optimisation:
         """See `Optimiser.optimise`; the best poses of all rounds. InputError as `lu-milios`."""
         levenberg.check_graph(graph)
-        best, history = graph, [graph.chi2()]
-        if not len(graph.edges) or not castellani.free_vertices(graph).any():
-            return Optimisation(graph, tuple(history), True)
+        poses, histories = graph.poses.copy(), []
+        for vertices, edges in levenberg.connected_components(graph):
+            if len(edges):
+                poses[vertices], history = self._descended(graph.subgraph(vertices, edges))
+                histories.append(history)
+        history = levenberg.total_history(histories)
+        return Optimisation(graph.with_poses(poses), history, not len(graph.edges))
+
+    def _descended(self, graph: PoseGraph) -> tuple[Float64, tuple[float, ...]]:
+        """Return the best poses of a connected graph, and the squared error after each round."""
+        best, history = graph.poses, [graph.chi2()]
         descent = _Descent(graph)
         for t in range(1, self.rounds + 1):
-            current = graph.with_poses(descent.round(1 / t))
-            if current.chi2() < min(history):
-                best = current
-            history.append(current.chi2())
+            poses = descent.round(1 / t)
+            poses[0] = graph.poses[0]
+            chi2 = graph.with_poses(poses).chi2()
+            if chi2 < min(history):
+                best = poses
+            history.append(chi2)
         if history[-1] > min(history):
             history.append(min(history))  # return to the best
-        return Optimisation(best, tuple(history), False)
+        return best, tuple(history)
 
 
 class _Descent:
@@ -69,16 +79,14 @@ class _Descent:
         self.stiffness = np.zeros((n, 2))
         for (i, j, _), w in zip(self.edges, self.weight, strict=True):
             self.stiffness[i + 1 : j + 1] += w
-        constrained = self.stiffness > 0
-        self.min_stiffness = np.array(
-            [self.stiffness[constrained[:, k], k].min() for k in range(2)]
-        )
+        softest = np.where(self.stiffness > 0, self.stiffness, np.inf).min(0)
+        self.min_stiffness = np.where(np.isfinite(softest), softest, 1.0)
 
     def round(self, rate: float) -> Float64:
         """Satisfy each edge once; returns the poses (N, 4, 4)."""
         for (i, j, Z), (w_t, w_R) in zip(self.edges, self.weight, strict=True):
             steps = slice(i + 1, j + 1)
-            compliance = 1 / self.stiffness[steps]
+            compliance = 1 / np.maximum(self.stiffness[steps], self.min_stiffness)
             # The fraction of the error to correct, and its distribution.
             gain = np.minimum(1.0, rate * (j - i) * np.array([w_t, w_R]) / self.min_stiffness)
             fractions = np.cumsum(compliance, axis=0) / compliance.sum(0)
