@@ -31,8 +31,6 @@ class Gravity:
         (g, 3) unit vectors, each in the frame of its camera.
     sigma
         (g,) standard deviation of each, rad.
-    world
-        (3,) the same direction in the world, or None if it is to be estimated.
     gate
         Squared error, in units of sigma, beyond which a direction has little weight (Geman and
         McClure), as a moving accelerometer measures more than gravity.
@@ -41,7 +39,6 @@ class Gravity:
     vertices: Intp
     directions: Float64
     sigma: Float64
-    world: Float64 | None = None
     gate: float = np.inf
 
     def vertical(self, observed: Float64) -> Float64:

@@ -19,8 +19,8 @@ _MAX_ANGLE = 3.0  # rad, of errors by the kernel
 class Problem:
     """Edges and gravity, evaluated and linearised.
 
-    An unknown direction of gravity in the world is an additional pose with only two observable
-    directions; a prior of unit information constrains the others.
+    The direction of gravity in the world is an additional pose with only two observable directions;
+    a prior of unit information constrains the others.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class Problem:
         if gravity is not None:
             world = np.full(len(gravity.vertices), n)
             all_pairs = np.concatenate([pairs, np.stack([world, gravity.vertices], axis=1)])
-            all_fixed = np.append(fixed, gravity.world is not None)
+            all_fixed = np.append(fixed, False)
             block = np.zeros((n + 1, 6, 6))
             block[n] = np.eye(6)
             self.unary = block, np.zeros((n + 1, 6))
@@ -51,11 +51,8 @@ class Problem:
         poses = np.array(poses, float)
         if self.gravity is None:
             return poses
-        down = self.gravity.world
-        if down is None:
-            R = poses[self.gravity.vertices, :3, :3]
-            observed = (R @ self.gravity.directions[..., None])[..., 0]
-            down = self.gravity.vertical(observed)
+        R = poses[self.gravity.vertices, :3, :3]
+        down = self.gravity.vertical((R @ self.gravity.directions[..., None])[..., 0])
         # A rotation with down as its third axis; the other two are arbitrary.
         down = down / np.linalg.norm(down)
         return np.concatenate([poses, se3.pose(np.stack([*tangents(down), down], axis=1))[None]])
