@@ -16,7 +16,8 @@ import numpy as np
 from tofuse.engine import quantities
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.errors import InputError, UnreadableFrameError, signals_as_themselves
-from tofuse.engine.frames import NOISE_MODEL, CloudFrame, Frame, RangeFrame, Recording, Source
+from tofuse.engine.frames import CloudFrame, Frame, RangeFrame, Recording, Source
+from tofuse.engine.noise import NOISE_MODEL
 from tofuse.engine.parts import check_number, discover, name_of, registered
 from tofuse.formats.cameras import camera_file, read_noise
 from tofuse.formats.files import reading
