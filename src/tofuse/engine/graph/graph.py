@@ -39,13 +39,11 @@ class Gravity:
     vertices: Intp
     directions: Float64
     sigma: Float64
-    gate: float = np.inf
+    gate: float
 
     def vertical(self, observed: Float64) -> Float64:
         """Return the (3,) robust mean of directions (g, 3) observed in the world."""
         weight = 1 / self.sigma**2
-        if np.isinf(self.gate):
-            return np.asarray((observed * weight[:, None]).sum(0), np.float64)
         down = np.median(observed, axis=0)  # robust to outliers
         for _ in range(10):
             down = down / max(float(np.linalg.norm(down)), 1e-12)

@@ -77,10 +77,9 @@ class Problem:
 
     def gravity_cost(self, down: Float64) -> float:
         """Return the contribution of gravity's errors (g, 3) to the objective."""
-        x = (down**2).sum(-1)
-        if self.gravity is None or np.isinf(self.gravity.gate):
-            return float((down**2).sum())
-        return float(robust.cost("geman-mcclure", x, self.gravity.gate).sum())
+        if self.gravity is None:
+            return 0.0
+        return float(robust.cost("geman-mcclure", (down**2).sum(-1), self.gravity.gate).sum())
 
     def linearised(
         self, poses: Float64, e: Float64, down: Float64, weights: Float64
@@ -95,10 +94,8 @@ class Problem:
             J[:, :, 3:] = (
                 -(R @ se3.hat(self.gravity.directions)) / self.gravity.sigma[:, None, None]
             )
-            Jt = np.swapaxes(J, 1, 2)
-            if np.isfinite(self.gravity.gate):
-                x = (down**2).sum(-1)
-                Jt = Jt * robust.weight("geman-mcclure", x, self.gravity.gate)[:, None, None]
+            weight = robust.weight("geman-mcclure", (down**2).sum(-1), self.gravity.gate)
+            Jt = np.swapaxes(J, 1, 2) * weight[:, None, None]
             H = np.concatenate([H, Jt @ J])
             g = np.concatenate([g, (Jt @ down[..., None])[..., 0]])
         return self.assembled(poses, T_i_j, H, g)
