@@ -30,13 +30,12 @@ import numpy as np
 from scipy.special import stdtrit
 
 from tofuse.engine.alignment import projective
-from tofuse.engine.arrays import Float32, Float64
+from tofuse.engine.arrays import Float32, Float64, Intp
 from tofuse.engine.compute import run_all
 from tofuse.engine.frames import Frame, RangeFrame, Recording
 from tofuse.engine.geometry import homogeneous, se3
 from tofuse.engine.mapping.recorded_views import RecordedViews
 from tofuse.engine.normal import robust_sigma
-from tofuse.engine.search import pair_agreement
 from tofuse.engine.views import PreparedView, SurfaceOptions, prepare_view
 
 # Degrees of freedom of Student's t (Lange, Little and Taylor 1989 suggest 4).
@@ -443,7 +442,7 @@ def _compared(
     point = ray * z[:, None]
     R = T[:3, :3]
     transformed = point @ R.T + T[:3, 3]
-    u, v, inside = pair_agreement.landing_pixels(t, transformed)
+    v, u, inside = _projected(t, transformed)
     target_plane = t.planes[v, u].astype(float)
     target_change = target.change[v, u].astype(float)
     length = np.linalg.norm(target_plane[:, :3], axis=1)
@@ -495,3 +494,23 @@ def _by_other_errors(points: Float64, normals: Float64) -> Float64:
     """Return how points (M, 3) move along normals by an offset of the range and a focal length."""
     along = np.einsum("ki,ki->k", normals, points) / np.linalg.norm(points, axis=1)
     return np.stack([along, (normals[:, :2] * points[:, :2]).sum(1)], 1)
+
+
+def _projected(view: PreparedView, points: Float64) -> tuple[Intp, ...]:
+    """Project points (M, 3): row and column (M,) of their pixels, and whether they are inside."""
+    grid = view.projection
+    in_front = points[:, 2] > 1e-3
+    xy = points[:, :2] / np.where(in_front, points[:, 2], 1)[:, None]
+    x0, y0, per_x, per_y = grid.frame
+    nodes = np.stack([(xy[:, 1] - y0) * per_y, (xy[:, 0] - x0) * per_x], 1)
+    last = np.array(grid.lookup.shape[:2]) - 1
+    inside = in_front & ((nodes >= 0) & (nodes <= last)).all(1)
+    a, b = np.rint(np.clip(nodes, 0, last)).astype(np.intp).T
+    u, v = np.rint(grid.lookup[a, b]).T
+    rows, columns = view.z.shape
+    inside &= (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
+    return (
+        np.where(inside, v, 0).astype(np.intp),
+        np.where(inside, u, 0).astype(np.intp),
+        inside.astype(bool),
+    )
