@@ -67,7 +67,7 @@ def test_loop_errors_are_chi_square_distributed(drawn) -> None:
     assert (loop_errors(replace(graph, measurements=bent), graph.poses) > 30).all()
     # Gravity is not odometry.
     down = np.swapaxes(graph.poses[:, :3, :3], 1, 2) @ [0, 0, 1]
-    gravity = Gravity(np.arange(N), down, np.full(N, 0.01))
+    gravity = Gravity(np.arange(N), down, np.full(N, 0.01), 25.0)
     np.testing.assert_array_equal(loop_errors(replace(graph, gravity=gravity), graph.poses), d[0])
 
 

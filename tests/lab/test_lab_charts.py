@@ -23,7 +23,7 @@ def test_minimum_is_that_of_tangents(chart: Chart, with_gravity: bool) -> None:
     graph, truth, _ = walk(20, 10)
     if with_gravity:
         down = np.swapaxes(truth[:, :3, :3], 1, 2) @ [0.0, 0.0, 1.0]
-        graph = replace(graph, gravity=Gravity(np.arange(20), down, np.full(20, 0.01)))
+        graph = replace(graph, gravity=Gravity(np.arange(20), down, np.full(20, 0.01), 1e6))
     least = minimise(graph, Settings("none", tolerance=1e-14))
     found = descend(graph, chart, tolerance=1e-14)
     objective = [chi2.sum() + of_gravity for chi2, of_gravity in found.log]

@@ -28,7 +28,13 @@ from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.images import write_png
 from tofuse.formats.recordings.joined import JoinedSource
 from tofuse.formats.recordings.native import RecordingWriter
-from tofuse.formats.recordings.open import Opening, open_recording, open_view, readers
+from tofuse.formats.recordings.open import (
+    Opening,
+    ReadingOptions,
+    open_recording,
+    open_view,
+    readers,
+)
 
 CAMERA = Pinhole(40, 30, 35.0, 36.0, 19.5, 14.5)
 
@@ -295,7 +301,7 @@ def test_factor_of_clouds_is_that_of_all_lengths(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.reference[1], se3.translation([1, 0, 0]))
     opening = Opening((tmp_path,), factor=0.001)
     assert Opening.from_dict(opening.to_dict(), tmp_path).factor == 0.001
-    view = open_view(f"{tmp_path}#1", factor=0.001)
+    view = open_view(f"{tmp_path}#1", ReadingOptions(factor=0.001))
     np.testing.assert_allclose(view.frame.points, points, atol=1e-4)
 
 

@@ -8,13 +8,12 @@ import numpy as np
 
 import tofuse
 from tofuse.engine.cameras.cameras import Pinhole
-from tofuse.engine.frames import NOISE_MODEL
 from tofuse.engine.frames.frames import CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.adaptation import with_recording_defaults
 from tofuse.engine.mapping.config import changed
 from tofuse.engine.mapping.methods import from_method
-from tofuse.engine.noise.model import NOISE, AmplitudeLaw, NoiseModel, RangeLaw
+from tofuse.engine.noise.model import NOISE, NOISE_MODEL, AmplitudeLaw, NoiseModel, RangeLaw
 from tofuse.engine.sensor.base import Noise
 
 CAMERA = Pinhole(60, 50, 60.0, 60.0, 29.5, 24.5)

@@ -112,9 +112,9 @@ def advise_on(so_far: OnlineMap) -> Advice | None:
     return None if known is None else best(known)
 
 
-def best(known: Known, within_s: float = np.inf) -> Advice:
-    """Return the best advice by what is known, with places of the last seconds only."""
-    poses, moves = candidates(known, within_s)
+def best(known: Known) -> Advice:
+    """Return the best advice by what is known."""
+    poses, moves = candidates(known)
     factors = known.factors(poses, [move.way for move in moves], _VIEWS)
     good = np.flatnonzero(1 - factors >= _NEARLY_BEST * (1 - factors.min()))
     chosen = min(good.tolist(), key=lambda k: moves[k].effort)
@@ -147,7 +147,7 @@ class Candidate:
     frame: int | None = None
 
 
-def candidates(known: Known, within_s: float = np.inf) -> tuple[Float64, list[Candidate]]:
+def candidates(known: Known) -> tuple[Float64, list[Candidate]]:
     """Return poses (M, 4, 4) relative to the centre, and turns and ways to earlier places."""
     now = known.poses[-1]
     poses: list[Float64] = []
@@ -160,8 +160,8 @@ def candidates(known: Known, within_s: float = np.inf) -> tuple[Float64, list[Ca
             poses.append(now @ R)
             way = tuple(range(first, len(poses)))
             moves.append(Candidate(way, _turn(yaw, pitch), float(se3.angle(R))))
-    earlier = np.flatnonzero(known.ages_s[:-1] <= within_s)
-    weakest = earlier[np.argsort(-known.step_squares[earlier], kind="stable")[:_WEAK]]
+    earlier = np.arange(len(known.poses) - 1)
+    weakest = np.argsort(-known.step_squares, kind="stable")[:_WEAK]
     halfway = se3.interpolate(
         known.poses[weakest], known.poses[weakest + 1], np.full(len(weakest), 0.5)
     )

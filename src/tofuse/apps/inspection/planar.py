@@ -31,7 +31,7 @@ from scipy.special import ndtr, stdtrit  # scipy.stats takes long to import
 
 from tofuse.engine.arrays import Bool, Float64, Int64
 from tofuse.engine.compute import tukey_kernels as tukey
-from tofuse.engine.connections import parts_of
+from tofuse.engine.connections import NEIGHBOURS, parts_of_image
 from tofuse.engine.normal import robust_sigma
 from tofuse.engine.views import PreparedView
 
@@ -116,20 +116,18 @@ def regions_of(view: PreparedView, frame: int) -> list[Region]:
 
 def _labels(view: PreparedView, is_valid: Bool) -> Int64:
     """(H, W) label of the region of each pixel."""
-    rows, columns = is_valid.shape
-    number = np.arange(rows * columns).reshape(rows, columns)
     normals, planes, rays = view.normals, view.planes, view.rays
     tolerance = np.hypot(
         _MAX_PLANE_FRACTION, _MAX_PLANE_SIGMAS * view.sigma / np.maximum(view.z, 1e-3)
     )
     links = []
-    for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+    for a, b in NEIGHBOURS:
         is_same = is_valid[a] & is_valid[b]
         is_same &= (normals[a] * normals[b]).sum(-1) > _MIN_NORMAL_COSINE
         predicted_w = (planes[b][..., :2] * rays[a]).sum(-1) + planes[b][..., 2]
         is_same &= np.abs(predicted_w - planes[a][..., 3]) < tolerance[a] * planes[a][..., 3]
-        links.append(np.stack([number[a][is_same], number[b][is_same]], 1))
-    return parts_of(number.size, np.concatenate(links)).reshape(is_valid.shape)
+        links.append(is_same)
+    return parts_of_image(is_valid.shape, links)
 
 
 @dataclass(frozen=True, eq=False)

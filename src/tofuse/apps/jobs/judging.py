@@ -29,7 +29,14 @@ from tofuse.engine.arrays import Float64, Intp
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.errors import InputError, signals_as_themselves
-from tofuse.engine.frames import Frame, Recording, Source, evenly_spaced, frame_ranges
+from tofuse.engine.frames import (
+    DerivedSource,
+    Frame,
+    Recording,
+    Source,
+    evenly_spaced,
+    frame_ranges,
+)
 from tofuse.engine.geometry import se3
 from tofuse.engine.mapping import Config, adaptation, clips, from_method, reconstructing
 from tofuse.engine.parts import check_number
@@ -419,22 +426,18 @@ def _refined(
     return refined
 
 
-@dataclass
-class _Keeping:
+class _Keeping(DerivedSource):
     """A source that keeps the first frames that are read."""
 
-    source: Source
-    frames: dict[int, Frame] = field(default_factory=dict)
-
-    def __getattr__(self, name: str) -> Any:
-        # Not self.source, which would end up here again while a copy is made and has none yet.
-        return getattr(object.__getattribute__(self, "source"), name)
+    def __init__(self, source: Source) -> None:
+        super().__init__(source)
+        self.frames: dict[int, Frame] = {}
 
     def read(self, index: int) -> Frame:
         """See `Source.read`."""
         if index in self.frames:
             return self.frames[index]
-        frame = self.source.read(index)
+        frame = super().read(index)
         if len(self.frames) < _KEPT:
             self.frames[index] = frame
         return frame
@@ -452,8 +455,7 @@ def _sample_of(recording: Recording, poses: Float64) -> Recording:
     enough = len(spaced) >= _MIN_SAMPLE
     chosen = [*spaced, indices[-1]] if enough else evenly_spaced(indices, _MIN_SAMPLE).tolist()
     chosen = np.unique(np.array([*chosen, *at_jumps], np.intp))
-    source: Any = _Keeping(recording.source)
-    return replace(recording, source=source, indices=chosen)
+    return replace(recording, source=_Keeping(recording.source), indices=chosen)
 
 
 def _jumps(recording: Recording, poses: Float64) -> dict[int, str]:

@@ -305,13 +305,7 @@ def _located_in(
             "names one frame already", where=name, remedy="leave out --start, --end and --every"
         )
     else:
-        view = open_view(
-            name,
-            format=options.format,
-            camera=options.camera,
-            topic=options.topic,
-            factor=options.factor,
-        )
+        view = open_view(name, options)
         frame, recording, is_clip = view.frame, view.recording, False
     if frame is not None and kind_of(frame) == "cloud":
         return [_located_cloud(result, name, options, progress)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -29,12 +28,12 @@ from tofuse.engine.parts import check_number
 from tofuse.engine.progress import Progress, Silent
 from tofuse.formats.files import atomic
 from tofuse.formats.poses import pose_text, read_pose
-from tofuse.formats.recordings import SingleView
+from tofuse.formats.recordings import ReadingOptions, SingleView
 
 
 @dataclass(frozen=True)
-class PairOptions(folders.OutputOptions):
-    """Options of the registration of two views.
+class PairOptions(ReadingOptions, folders.OutputOptions):
+    """Options of the registration of two views, `factor` of the source's coordinates alone.
 
     Attributes
     ----------
@@ -44,12 +43,8 @@ class PairOptions(folders.OutputOptions):
         Name of a registration method; None for `AnyPair`.
     scale
         Whether the source is of unknown scale.
-    factor
-        Of the source's coordinates, if its unit is another than the target's.
     risk
         Largest probability, up to `MAX_RISK`, with which an accepted pose may be wrong.
-    format, camera, topic
-        As in `open_recording`. The camera is that of all inputs that store images.
     threads
         Number of threads; None for all cores.
     """
@@ -57,11 +52,7 @@ class PairOptions(folders.OutputOptions):
     guess: Path | None = None
     method: str | None = None
     scale: bool = False
-    factor: float | None = None
     risk: float = MAX_RISK
-    format: str | None = None
-    camera: Path | None = None
-    topic: str | None = None
     threads: int | None = None
 
 
@@ -123,18 +114,14 @@ def _open_both(source: str, target: str, options: PairOptions) -> tuple[SingleVi
     """Open both views; one of them may be a cloud, which needs no camera."""
     views: list[SingleView] = []
     refusals: list[InputError] = []
-    for name, factor in ((source, options.factor), (target, None)):
-        open_with = partial(
-            named_view, name, format=options.format, topic=options.topic, factor=factor
-        )
-
+    for name, reading in ((source, options), (target, replace(options, factor=None))):
         try:
-            views.append(open_with(camera=options.camera))
+            views.append(named_view(name, reading))
         except InputError as error:
             if error.where != "--camera":
                 raise
             refusals.append(error)
-            views.append(open_with())
+            views.append(named_view(name, replace(reading, camera=None)))
     if len(refusals) == 2:
         raise refusals[0]
     return views[0], views[1]

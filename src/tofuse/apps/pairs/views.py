@@ -19,7 +19,7 @@ from tofuse.engine.fusion import Mesh
 from tofuse.engine.geometry import se3
 from tofuse.engine.results import Reconstruction
 from tofuse.formats.geometry import surface_points
-from tofuse.formats.recordings import SingleView, open_view
+from tofuse.formats.recordings import ReadingOptions, SingleView, open_view
 
 
 @runtime_checkable
@@ -52,7 +52,7 @@ def view_of(view: View, name: str, factor: float | None = None) -> Frame:
         If it has fewer than ten finite points, or is nothing of that kind.
     """
     if isinstance(view, str | os.PathLike):
-        return named_view(os.fspath(view), factor=factor).frame
+        return named_view(os.fspath(view), ReadingOptions(factor=factor)).frame
     if isinstance(view, RangeFrame | CloudFrame):
         return at_factor(view, factor)
     points: ArrayLike
@@ -70,20 +70,14 @@ def at_factor(view: Frame, factor: float | None) -> Frame:
     return view if factor is None else scaled(view, factor)
 
 
-def named_view(
-    name: str,
-    *,
-    format: str | None = None,  # noqa: A002
-    camera: Path | None = None,
-    topic: str | None = None,
-    factor: float | None = None,
-) -> SingleView:
+def named_view(name: str, options: ReadingOptions | None = None) -> SingleView:
     """Read the view called `name`: the cloud of a result, or see `open_view`."""
+    options = options or ReadingOptions()
     folder = Path(name)
-    if format is None and folders.named_result(folder):
+    if options.format is None and folders.named_result(folder):
         frame = CloudFrame.of(_checked(read_cloud(folder).points, name))
-        return SingleView(name, name, "result", 0, at_factor(frame, factor))
-    return open_view(name, format=format, camera=camera, topic=topic, factor=factor, file_axes=True)
+        return SingleView(name, name, "result", 0, at_factor(frame, options.factor))
+    return open_view(name, options, file_axes=True)
 
 
 def _checked(points: ArrayLike, name: str) -> Float64:

@@ -6,14 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from tofuse.apps.results import run_json
 from tofuse.apps.results.folders import RECORDING
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import Frame, Recording, Source
+from tofuse.engine.frames import DerivedSource, Frame, Recording, Source
 from tofuse.engine.mapping import Config, changed, from_method
 from tofuse.formats.recordings import Opening
 
@@ -175,7 +175,7 @@ def reopen(part: StoredRecording, folder: Path) -> Recording:
     recording = opening.open()
     is_part = np.isin(recording.indices, part.frames)
     matches = int(is_part.sum()) == len(part.frames)
-    source = cast(Source, _Unchanged(recording.source, part.depths, folder))
+    source = _Unchanged(recording.source, part.depths, folder)
     recording = replace(recording, source=source, indices=recording.indices[is_part])
     if matches and part.times is not None:
         times = np.array([part.times[k] for k in recording.indices.tolist()])
@@ -201,19 +201,16 @@ def _changed(folder: Path, what: str) -> InputError:
     return InputError(problem, where=folder, remedy="run `tofuse run` again")
 
 
-class _Unchanged:
+class _Unchanged(DerivedSource):
     """A source whose frames must have the mean depths of a result's."""
 
     def __init__(self, source: Source, depths: Mapping[int, float], folder: Path) -> None:
-        self._source, self._depths, self._folder = source, depths, folder
-
-    def __getattr__(self, name: str) -> Any:
-        # Not self._source, which would end up here again while a copy is made and has none yet.
-        return getattr(object.__getattribute__(self, "_source"), name)
+        super().__init__(source)
+        self._depths, self._folder = depths, folder
 
     def read(self, index: int) -> Frame:
         """See `Source.read`."""
-        frame = self._source.read(index)
+        frame = super().read(index)
         expected = self._depths.get(index)
         if expected is not None and abs(frame.mean_depth - expected) > _SAME_DEPTH * expected:
             raise _changed(self._folder, f"its recording at frame {index}")

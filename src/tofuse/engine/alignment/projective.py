@@ -250,7 +250,6 @@ def align(
     options: ProjectiveOptions,
     *,
     start: Float64 | None = None,
-    exposure: float | None = None,
     usual_scale: float = 0.0,
 ) -> Aligned:
     """Align a view with one or more others.
@@ -263,8 +262,6 @@ def align(
         (4, 4) predicted pose of the source; kept along degenerate directions.
     start
         (4, 4) initial pose; the prediction unless given.
-    exposure
-        Initial log albedo of the targets minus the source's; estimated at the start unless given.
     usual_scale
         Usual noise scale of this camera's alignments, if known: the noise scale is bounded by three
         times this value, even beyond `max_sigma_m`.
@@ -278,9 +275,7 @@ def align(
     points = _points_of_level(source, options.levels[0])
     nuisance = np.array([0.0, 1.0, 0.1 if photometric else 0.0])
     if photometric:
-        nuisance[steps.EXPOSURE] = (
-            _initial_exposure(points, targets, T0) if exposure is None else exposure
-        )
+        nuisance[steps.EXPOSURE] = _initial_exposure(points, targets, T0)
     max_scale = 10.0  # relative to the stated sigmas of the views
     if len(points):
         sigma = points[:, kernels.SIGMA] * points[:, kernels.POINT + 2]

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32
 from tofuse.engine.bounds import Bounded, Bounds
-from tofuse.engine.connections import parts_of
+from tofuse.engine.connections import NEIGHBOURS, parts_of_image
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters.base import Filter
 from tofuse.engine.frames import Frame, RangeFrame
@@ -329,7 +329,7 @@ def _always_occluded(z: Float32, passing: Float32, frequency: Float64) -> Bool:
     label = _segments(z)
     count = int(label.max()) + 1
     rim, joined = np.zeros(count), np.zeros(count)
-    for a, b in _neighbours():
+    for a, b in NEIGHBOURS:
         for p, q in ((a, b), (b, a)):
             boundary = label[p] != label[q]
             segment, z_segment = label[p][boundary], z[p][boundary]
@@ -358,22 +358,14 @@ def _segments(z: Float32) -> Int32:
 
     Pixels at a jump belong to the segment on their side of it.
     """
-    rows, columns = z.shape
-    pixel = np.arange(rows * columns).reshape(rows, columns)
-    pairs = []
-    for a, b in _neighbours():
+
+    def connected(a: Float32, b: Float32) -> Bool:
         with np.errstate(invalid="ignore"):
-            connected = np.abs(z[a] - z[b]) <= _JUMP * np.minimum(z[a], z[b])
-        connected |= np.isinf(z[a]) & np.isinf(z[b])
-        connected &= (z[a] > 0) & (z[b] > 0)
-        pairs.append(np.stack([pixel[a][connected], pixel[b][connected]], 1))
-    label = parts_of(z.size, np.concatenate(pairs))
-    return np.where(z > 0, label.reshape(z.shape) + 1, 0).astype(np.int32)
+            alike = np.abs(a - b) <= _JUMP * np.minimum(a, b)
+        return (alike | (np.isinf(a) & np.isinf(b))) & (a > 0) & (b > 0)
 
-
-def _neighbours() -> tuple[tuple[tuple[slice, slice], tuple[slice, slice]], ...]:
-    """Slices for all pairs of neighbouring pixels: along the rows, and along the columns."""
-    return ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:, :], np.s_[:-1, :]))
+    label = parts_of_image(z.shape, (connected(z[a], z[b]) for a, b in NEIGHBOURS))
+    return np.where(z > 0, label + 1, 0).astype(np.int32)
 
 
 def _without_speckle(mask: Bool) -> Bool:
@@ -389,7 +381,7 @@ def _without_speckle(mask: Bool) -> Bool:
 def _outline(mask: Bool, z: Float32) -> float:
     """Fraction of a mask's outline at which the surface ends: a jump, or no measurement."""
     total = ends = 0
-    for a, b in _neighbours():
+    for a, b in NEIGHBOURS:
         for p, q in ((a, b), (b, a)):
             rim = mask[p] & ~mask[q]
             inside, outside = z[p][rim], z[q][rim]

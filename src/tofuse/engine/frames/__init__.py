@@ -21,9 +21,9 @@ if TYPE_CHECKING:
         map_shift,
     )
     from tofuse.engine.frames.recording import (
-        NOISE_MODEL,
         POSES_BY,
         ArraySource,
+        DerivedSource,
         Recording,
         Source,
         evenly_spaced,

@@ -21,10 +21,8 @@ from tofuse.engine.frames.frames import Frame, RangeFrame
 R = TypeVar("R")
 S = TypeVar("S", bound=np.generic)
 
-# Keys of a source's metadata: the system of the device that `reference` is of, such as ARKit; and
-# the noise model (`engine.noise`) that came with the recording.
+# Key of a source's metadata: the system of the device that `reference` is of, such as ARKit.
 POSES_BY = "poses_by"
-NOISE_MODEL = "noise_model"
 
 
 class Source(Protocol):
@@ -62,6 +60,28 @@ class Source(Protocol):
     def read(self, index: int) -> Frame:
         """Read frame `index`; raise UnreadableFrameError if it can't be read."""
         ...
+
+
+class DerivedSource:
+    """A source that is another one, except for what a subclass or its user sets."""
+
+    timestamps: Float64
+    reference: Float64 | None
+    odometry: Float64 | None
+    gravity: Float64 | None
+    metadata: dict[str, Any]
+    warnings: list[str]
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+
+    def __getattr__(self, name: str) -> Any:
+        # Not self.source, which would end up here again while a copy is made and has none yet.
+        return getattr(object.__getattribute__(self, "source"), name)
+
+    def read(self, index: int) -> Frame:
+        """See `Source.read`."""
+        return self.source.read(index)
 
 
 @dataclass

@@ -162,7 +162,7 @@ class SensorPriors:
         if not matches:
             return None
         vertices, rows = np.array(matches, np.intp).T
-        return Gravity(vertices, self.gravity[rows, :3], self.gravity[rows, 3], None, self.gate)
+        return Gravity(vertices, self.gravity[rows, :3], self.gravity[rows, 3], self.gate)
 
     def up(self, graph: PoseGraph) -> Float64 | None:
         """Return the unit vector (3,) opposite to gravity in the graph's world, or None."""
@@ -252,7 +252,7 @@ class GravityEdges(Bounded, ExternalSensor):
         # a single one with the shared error alone.
         inflation = 1 + float((self.shared_rad**2 / measured[:, 3] ** 2).sum())
         observed = (graph.poses[rows, :3, :3] @ measured[:, :3, None])[..., 0]
-        down = Gravity(rows, measured[:, :3], measured[:, 3], None, self.gate).vertical(observed)
+        down = Gravity(rows, measured[:, :3], measured[:, 3], self.gate).vertical(observed)
         chi2 = ((observed - down / np.linalg.norm(down)) ** 2).sum(1) / measured[:, 3] ** 2
         used = int((chi2 <= self.gate).sum())
         measured[:, 3] *= np.sqrt(inflation)

@@ -31,8 +31,6 @@ class Gravity:
         (g, 3) unit vectors, each in the frame of its camera.
     sigma
         (g,) standard deviation of each, rad.
-    world
-        (3,) the same direction in the world, or None if it is to be estimated.
     gate
         Squared error, in units of sigma, beyond which a direction has little weight (Geman and
         McClure), as a moving accelerometer measures more than gravity.
@@ -41,14 +39,11 @@ class Gravity:
     vertices: Intp
     directions: Float64
     sigma: Float64
-    world: Float64 | None = None
-    gate: float = np.inf
+    gate: float
 
     def vertical(self, observed: Float64) -> Float64:
         """Return the (3,) robust mean of directions (g, 3) observed in the world."""
         weight = 1 / self.sigma**2
-        if np.isinf(self.gate):
-            return np.asarray((observed * weight[:, None]).sum(0), np.float64)
         down = np.median(observed, axis=0)  # robust to outliers
         for _ in range(10):
             down = down / max(float(np.linalg.norm(down)), 1e-12)

@@ -19,8 +19,8 @@ _MAX_ANGLE = 3.0  # rad, of errors by the kernel
 class Problem:
     """Edges and gravity, evaluated and linearised.
 
-    An unknown direction of gravity in the world is an additional pose with only two observable
-    directions; a prior of unit information constrains the others.
+    The direction of gravity in the world is an additional pose with only two observable directions;
+    a prior of unit information constrains the others.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class Problem:
         if gravity is not None:
             world = np.full(len(gravity.vertices), n)
             all_pairs = np.concatenate([pairs, np.stack([world, gravity.vertices], axis=1)])
-            all_fixed = np.append(fixed, gravity.world is not None)
+            all_fixed = np.append(fixed, False)
             block = np.zeros((n + 1, 6, 6))
             block[n] = np.eye(6)
             self.unary = block, np.zeros((n + 1, 6))
@@ -51,11 +51,8 @@ class Problem:
         poses = np.array(poses, float)
         if self.gravity is None:
             return poses
-        down = self.gravity.world
-        if down is None:
-            R = poses[self.gravity.vertices, :3, :3]
-            observed = (R @ self.gravity.directions[..., None])[..., 0]
-            down = self.gravity.vertical(observed)
+        R = poses[self.gravity.vertices, :3, :3]
+        down = self.gravity.vertical((R @ self.gravity.directions[..., None])[..., 0])
         # A rotation with down as its third axis; the other two are arbitrary.
         down = down / np.linalg.norm(down)
         return np.concatenate([poses, se3.pose(np.stack([*tangents(down), down], axis=1))[None]])
@@ -80,10 +77,9 @@ class Problem:
 
     def gravity_cost(self, down: Float64) -> float:
         """Return the contribution of gravity's errors (g, 3) to the objective."""
-        x = (down**2).sum(-1)
-        if self.gravity is None or np.isinf(self.gravity.gate):
-            return float((down**2).sum())
-        return float(robust.cost("geman-mcclure", x, self.gravity.gate).sum())
+        if self.gravity is None:
+            return 0.0
+        return float(robust.cost("geman-mcclure", (down**2).sum(-1), self.gravity.gate).sum())
 
     def linearised(
         self, poses: Float64, e: Float64, down: Float64, weights: Float64
@@ -98,10 +94,8 @@ class Problem:
             J[:, :, 3:] = (
                 -(R @ se3.hat(self.gravity.directions)) / self.gravity.sigma[:, None, None]
             )
-            Jt = np.swapaxes(J, 1, 2)
-            if np.isfinite(self.gravity.gate):
-                x = (down**2).sum(-1)
-                Jt = Jt * robust.weight("geman-mcclure", x, self.gravity.gate)[:, None, None]
+            weight = robust.weight("geman-mcclure", (down**2).sum(-1), self.gravity.gate)
+            Jt = np.swapaxes(J, 1, 2) * weight[:, None, None]
             H = np.concatenate([H, Jt @ J])
             g = np.concatenate([g, (Jt @ down[..., None])[..., 0]])
         return self.assembled(poses, T_i_j, H, g)

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
         Config,
         ViewKind,
         changed,
-        check_views,
         kind_of,
     )
     from tofuse.engine.mapping.frame_log import FrameLog

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeVar, get_args
+from dataclasses import replace
+from typing import Literal, TypeVar, get_args
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -14,7 +14,7 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import threads as use_threads
 from tofuse.engine.errors import InputError
 from tofuse.engine.filters import Confidence, Filter
-from tofuse.engine.frames import POSES_BY, Frame, RangeFrame, Recording, Source
+from tofuse.engine.frames import POSES_BY, DerivedSource, Frame, RangeFrame, Recording
 from tofuse.engine.graph import external_sensors
 from tofuse.engine.mapping.config import Config, check_views, kind_of
 from tofuse.engine.mapping.falloff import RANGE, estimate_falloff
@@ -322,21 +322,9 @@ def _uses(config: Config, sensor: type[external_sensors.ExternalSensor]) -> bool
     return any(isinstance(used, sensor) for used in config.priors)
 
 
-@dataclass
-class _WithOdometry:
-    """A source with its odometry replaced."""
-
-    source: Source
-    odometry: Float64 | None
-
-    def __getattr__(self, name: str) -> Any:
-        # Not self.source, which would end up here again while a copy is made and has none yet.
-        return getattr(object.__getattribute__(self, "source"), name)
-
-
 def with_odometry(recording: Recording, poses: Float64) -> Recording:
     """Return the recording with poses (N, 4, 4) as its odometry."""
-    source_poses = np.full((len(recording.source.timestamps), 4, 4), np.nan)
-    source_poses[recording.indices] = poses
-    source: Any = _WithOdometry(recording.source, source_poses)
+    source = DerivedSource(recording.source)
+    source.odometry = np.full((len(source.timestamps), 4, 4), np.nan)
+    source.odometry[recording.indices] = poses
     return replace(recording, source=source)

@@ -235,9 +235,7 @@ def _slope(source: PreparedView, target: PreparedView, T: Float64, law: Law) -> 
     packed = projective.points_of(source, 2).astype(np.float64)
     p = packed[:, residual_kernels.POINT : residual_kernels.POINT + 3]
     q = p @ T[:3, :3].T + T[:3, 3]
-    u, v = pair_agreement.landing_pixels(target, q).T
-    rows, columns = target.z.shape
-    inside = (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
+    u, v, inside = pair_agreement.landing_pixels(target, q)
     p, q, u, v = p[inside], q[inside], u[inside], v[inside]
     z = target.planes[v, u, 3].astype(np.float64)
     matched = (z > 0) & (

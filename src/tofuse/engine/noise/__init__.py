@@ -12,6 +12,7 @@ from tofuse._faces import face
 if TYPE_CHECKING:
     from tofuse.engine.noise.model import (
         NOISE,
+        NOISE_MODEL,
         AmplitudeLaw,
         ConfidenceLaw,
         Law,

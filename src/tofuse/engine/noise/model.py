@@ -27,13 +27,15 @@ from tofuse.engine.bounds import Bounded, Bounds, NotEmpty
 from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.compute import run_chunks
 from tofuse.engine.errors import InputError
-from tofuse.engine.frames import NOISE_MODEL, RangeFrame, Recording
+from tofuse.engine.frames import RangeFrame, Recording
 from tofuse.engine.noise import noise_kernels as kernels
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.engine.parts import from_dict, to_dict
 
 Law = Literal["range", "amplitude", "confidence", "camera"]
 
+# Key of a source's metadata: the model that came with the recording.
+NOISE_MODEL = "noise_model"
 SCHEMA = 1
 _CODES = {
     "range": kernels.BY_RANGE,

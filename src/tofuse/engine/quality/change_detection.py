@@ -163,12 +163,9 @@ def _compare(
     T = se3.inverse(target.T_world_camera) @ source.T_world_camera
     points = se3.transform(T, source.points.points.astype(np.float64))
     view = target.view
-    pixel = pair_agreement.landing_pixels(view, points)
-    rows, columns = view.z.shape
-    inside = (pixel >= 0).all(1) & (pixel[:, 0] < columns) & (pixel[:, 1] < rows)
-    inside[inside] = target.nearest[pixel[inside, 1], pixel[inside, 0]] > 0
-    projected = np.flatnonzero(inside)
-    j, i = pixel[projected].T
+    j, i, inside = pair_agreement.landing_pixels(view, points)
+    projected = np.flatnonzero(inside & (target.nearest[i, j] > 0))
+    i, j = i[projected], j[projected]
     p = points[projected]
     plane = view.planes[i, j].astype(np.float64)
     length = np.linalg.norm(plane[:, :3], axis=1)

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
         joint_alignment,
         plane_refinement,
     )
-    from tofuse.engine.refinement.joint_alignment import Priors
     from tofuse.engine.refinement.refinement import (
         AlreadyRefined,
         Joint,

@@ -283,8 +283,13 @@ def sampled_points(view: PreparedView, count: int) -> ViewPoints:
     )
 
 
-def landing_pixels(view: PreparedView, points: Float64) -> Intp:
-    """Return column and row (N, 2) of the pixels that points (N, 3) project to; -1 outside."""
+def landing_pixels(view: PreparedView, points: Float64) -> tuple[Intp, Intp, Bool]:
+    """Return column and row (N,) of the pixels that points (N, 3) project to, and which do to any.
+
+    Column and row are 0 for those outside of the image.
+    """
     z = np.where(points[:, 2] > 1e-3, points[:, 2], np.nan)
-    pixels = view.projection.pixels(points[:, :2] / z[:, None])
-    return np.where(np.isnan(pixels), -1, np.rint(pixels)).astype(np.intp)
+    pixels = np.rint(view.projection.pixels(points[:, :2] / z[:, None]))
+    inside: Bool = np.all((pixels >= 0) & (pixels < view.z.shape[::-1]), axis=1)
+    u, v = np.where(inside[:, None], pixels, 0).astype(np.intp).T
+    return u, v, inside

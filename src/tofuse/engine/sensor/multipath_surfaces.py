@@ -156,17 +156,18 @@ def visible_sources(surfaces: Surfaces, radiosity: Complex128) -> Float32:
 
 
 class ReflectorMap:
-    """Map of the reflecting surfaces of recent views, spaced by the motion of the camera."""
+    """Map of the reflecting surfaces of recent views, spaced by the motion of the camera.
+
+    Attributes
+    ----------
+    patches
+        (N, PATCH) in the world frame, see `multipath_kernels.project_patches`.
+    """
 
     def __init__(self) -> None:
         self._views: deque[Float32] = deque(maxlen=_VIEWS)
         self._T: Float64 | None = None  # of the newest view
-        self._patches = np.zeros((0, PATCH), np.float32)
-
-    @property
-    def patches(self) -> Float32:
-        """(N, PATCH) in the world frame, see `multipath_kernels.project_patches`."""
-        return self._patches
+        self.patches = np.zeros((0, PATCH), np.float32)
 
     def add(self, surfaces: Surfaces, static: Bool, T_world_camera: Float64) -> None:
         """Add the surfaces of a view at every other node, unless the last view was close.
@@ -202,7 +203,7 @@ class ReflectorMap:
         table[:, 3:6] = np.einsum("nc,dc->nd", table[:, 3:6], R)
         self._views.append(table.astype(np.float32))
         self._T = T_world_camera
-        self._patches = np.concatenate(list(self._views))
+        self.patches = np.concatenate(list(self._views))
 
 
 @dataclass(eq=False)

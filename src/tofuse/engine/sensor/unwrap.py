@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from tofuse.engine.arrays import Bool, Float32, Float64, Int32, Intp
 from tofuse.engine.bounds import Bounded, Bounds
 from tofuse.engine.compute import run_chunks
-from tofuse.engine.connections import parts_of
+from tofuse.engine.connections import NEIGHBOURS, parts_of
 from tofuse.engine.frames import Frame, RangeFrame
 from tofuse.engine.parts import part
 from tofuse.engine.sensor.base import FrameCorrection
@@ -326,7 +326,7 @@ def _reset_isolated(blocks: _Blocks, best: Intp, period: float, options: UnwrapO
     components, count = scipy.ndimage.label(wrapped)
     boundary = np.zeros(count + 1)
     entries = np.zeros(count + 1)
-    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+    for a, b in NEIGHBOURS:
         for inside, outside in ((a, b), (b, a)):
             border = wrapped[inside] & ~wrapped[outside] & blocks.valid[outside]
             range_inside = blocks.range_m[inside] + best[inside] * period

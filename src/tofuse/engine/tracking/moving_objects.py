@@ -21,6 +21,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Bool, Float32, Float64, UInt8
 from tofuse.engine.compute import median, run_chunks
+from tofuse.engine.connections import NEIGHBOURS
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.geometry import se3
 from tofuse.engine.tracking import moving_object_kernels as kernels
@@ -269,7 +270,10 @@ class MovingObjects:
         cells, arrived = self._propagated(view, T_world_camera)
         reference_cells = self._reference(reference)
         T_reference_view = np.ascontiguousarray(se3.inverse(T_world_reference) @ T_world_camera)
-        scale = self._scale(view, cells.moving, reference, T_reference_view)
+        ratios = kernels.residual_ratios(
+            _sampled(view), cells.moving, _SCALE_EVERY, _sampled(reference), T_reference_view
+        )
+        scale = _robust_scale(ratios)
         typical_scale = median(np.array(self._scales)) if self._scales else scale
         # The noise may be underestimated, but not overestimated.
         clipped_scale = max(1.0, min(scale, _MAX_SCALE_RATIO * max(typical_scale, 1.0)))
@@ -397,15 +401,6 @@ class MovingObjects:
         run_chunks(work, shape[0], max(1, shape[0] // _CHUNK_ROWS))
         return kernels.Cells(depth, odds, odds > _DETECT, tracked), arrived
 
-    def _scale(
-        self, view: PreparedView, moving: Bool, reference: PreparedView, T: Float64
-    ) -> float:
-        """Return the robust scale of the residuals between two views, in sigmas."""
-        ratios = kernels.residual_ratios(
-            _sampled(view), moving, _SCALE_EVERY, _sampled(reference), T
-        )
-        return _robust_scale(ratios)
-
     def _updated(self, cells: kernels.Cells, evidence: Float32) -> kernels.Cells:
         """Add the evidence of a pair of views."""
         prior = np.float32(kernels.PRIOR_ODDS)
@@ -452,7 +447,7 @@ class MovingObjects:
         """
         jump = np.float32(0.5 * kernels.EDGE_JUMP)
         interior = depth > 0
-        for a, b in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
+        for a, b in NEIGHBOURS:
             interior[a] &= np.abs(depth[a] - depth[b]) <= jump * depth[b]
         count, labels = cv2.connectedComponents(interior.view(np.uint8), connectivity=4)
         sizes = np.bincount(labels.ravel(), minlength=count)

@@ -321,10 +321,7 @@ def _pattern_residual(view: PreparedView, other: PreparedView, T: Float64, cells
     grid = np.s_[::stride, ::stride]
     z, rays, albedo = view.z[grid][cells], view.rays[grid][cells], view.albedo[grid][cells]
     points = se3.transform(T, homogeneous(rays) * z[:, None])
-    pixels = pair_agreement.landing_pixels(other, points)
-    size = np.array(other.z.shape[::-1])
-    inside = np.all((pixels >= 0) & (pixels < size), axis=1)
-    u, v = np.where(inside[:, None], pixels, 0).T
+    u, v, inside = pair_agreement.landing_pixels(other, points)
     seen = other.albedo[v, u]
     offset = points[:, :2] / points[:, 2:] - other.rays[v, u]
     difference = albedo[:, 0] - seen[:, 0] - (seen[:, 1:] * offset).sum(1)

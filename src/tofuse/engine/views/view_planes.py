@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,13 +18,12 @@ import numpy as np
 from tofuse.engine.arrays import Bool, Float32, UInt8
 from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.compute import median, run_chunks
+from tofuse.engine.connections import NEIGHBOURS
 from tofuse.engine.frames import RangeFrame
 from tofuse.engine.normal import MEDIAN_OF_NORMAL
 from tofuse.engine.views.projection import Projection
 from tofuse.engine.views.view_planes_kernels import fit_planes
 
-# Neighbours along the rows, and along the columns.
-_NEIGHBOURS: tuple[tuple[Any, Any], ...] = ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1]))
 # Rows of a chunk: many, as chunks cost synchronisation and their windows overlap; fixed, so that
 # the result does not depend on the number of threads.
 _CHUNK_ROWS = 60
@@ -173,7 +171,7 @@ def edge_pixels(w: Float32, jump: float, margin: int) -> Bool:
 def edge_pixels_by_noise(w: Float32, noise: Float32, options: SurfaceOptions) -> Bool:
     """Return `edge_pixels` for the noise (H, W) of each pixel, relative to the depth."""
     limits = []
-    for a, b in _NEIGHBOURS:
+    for a, b in NEIGHBOURS:
         n, m = noise[a] ** 2, noise[b] ** 2
         # A large change of the noise is an edge between surfaces.
         noise_step = np.float32(options.edge_sigmas) * np.sqrt(
@@ -187,7 +185,7 @@ def edge_pixels_by_noise(w: Float32, noise: Float32, options: SurfaceOptions) ->
 def _edge_pixels(w: Float32, limits: Sequence[Float32 | np.float32], margin: int) -> Bool:
     """Return the pixels near relative steps above the limits between columns and between rows."""
     edge = np.zeros(w.shape, np.uint8)
-    for (a, b), limit in zip(_NEIGHBOURS, limits, strict=True):
+    for (a, b), limit in zip(NEIGHBOURS, limits, strict=True):
         is_step = np.abs(w[a] - w[b]) > limit * np.maximum(w[a], w[b])
         edge[a] |= is_step
         edge[b] |= is_step

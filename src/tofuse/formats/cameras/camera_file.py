@@ -448,10 +448,7 @@ def _lens(get: _Fields) -> tuple[Pinhole | None, tuple[int, int]]:
             f"use [{' '.join(order)}], or another model",
         )
     values |= {name: float(v) for name, v in zip(order, coefficients, strict=False)}
-    cls = MODELS[model]
-    parameters = {f.name for f in fields(cls)}
-    values = {name: v for name, v in values.items() if name in parameters}
-    return checked_lens(cls, size, values, get.where), size
+    return checked_lens(MODELS[model], size, values, get.where), size
 
 
 def image_size(width: float, height: float, where: str | Path) -> tuple[int, int]:

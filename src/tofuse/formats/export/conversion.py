@@ -15,7 +15,6 @@ from tofuse.engine.arrays import Float64, UInt8
 from tofuse.engine.cameras import Camera, Pinhole, RayTable
 from tofuse.engine.errors import InputError, UnreadableFrameError
 from tofuse.engine.frames import (
-    NOISE_MODEL,
     POSES_BY,
     CloudFrame,
     Frame,
@@ -23,6 +22,7 @@ from tofuse.engine.frames import (
     Recording,
     depth_counts,
 )
+from tofuse.engine.noise import NOISE_MODEL
 from tofuse.engine.sensor import DepthCorrection
 from tofuse.formats.cameras import Rectifier, camera_file, pinhole_of, write_noise
 from tofuse.formats.files import atomic, staging

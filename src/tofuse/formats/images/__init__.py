@@ -17,7 +17,6 @@ if TYPE_CHECKING:
         first_size,
         jpeg_bytes,
         parse_image,
-        png_bytes,
         read_color,
         read_header,
         read_image,

@@ -31,10 +31,8 @@ class Arducam(Reader):
         if not images:
             return None
         evidence = f"{len(images)} depth images of Arducam's examples"
-        if reading.is_file(path / "camera.json"):
-            return Sniff(1.0, f"{evidence} and camera.json")
         remedy = "use --format arducam with --camera: lens and unit are not in such files"
-        return Sniff(Sniff.UNCERTAIN, evidence, remedy, needs_camera=True)
+        return Sniff.by_camera_file(path, evidence, remedy)
 
     def open(self, path: Path, options: ReaderOptions) -> ArducamSource:
         """See `Reader.open`."""

@@ -28,10 +28,8 @@ class Depth16(Reader):
         if not files:
             return None
         evidence = f"{len(files)} DEPTH16 images"
-        if reading.is_file(path / "camera.json"):
-            return Sniff(1.0, f"{evidence} and camera.json")
         remedy = "use --format depth16 with --camera: size and lens are not in such files"
-        return Sniff(Sniff.UNCERTAIN, evidence, remedy, needs_camera=True)
+        return Sniff.by_camera_file(path, evidence, remedy)
 
     def open(self, path: Path, options: ReaderOptions) -> Depth16Source:
         """See `Reader.open`."""

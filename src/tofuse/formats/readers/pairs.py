@@ -27,10 +27,8 @@ class Pairs(Reader):
         if not files:
             return None
         evidence = f"{quantities.count(len(files), 'image')} like {files[0].name}"
-        if reading.is_file(path / "camera.json"):
-            return Sniff(1.0, f"{evidence} and camera.json")
         remedy = "use --format pairs with --camera camera.json, which states lens and depth_unit_m"
-        return Sniff(Sniff.UNCERTAIN, evidence, remedy, needs_camera=True)
+        return Sniff.by_camera_file(path, evidence, remedy)
 
     def open(self, path: Path, options: ReaderOptions) -> DepthImageSource:
         """See `Reader.open`."""

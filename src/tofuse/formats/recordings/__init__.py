@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         FACTORS,
         Opening,
         OpeningOptions,
+        ReadingOptions,
         SingleView,
         is_recording,
         open_recording,

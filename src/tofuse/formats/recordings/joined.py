@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tofuse.engine.arrays import Float64
-from tofuse.engine.frames import CloudFrame, Frame, RangeFrame, Source
+from tofuse.engine.frames import CloudFrame, DerivedSource, Frame, RangeFrame, Source
 
 
 class JoinedSource:
@@ -106,38 +105,7 @@ def _joined(
 _LENGTHS = ("depth", "sigma_image", "shared_sigma_image")
 
 
-class _DerivedSource:
-    """A source whose frames are made of those of another one."""
-
-    def __init__(self, source: Source) -> None:
-        self.source = source
-        self.concurrent = getattr(source, "concurrent", False)
-        self.timestamps = source.timestamps
-        self.reference = source.reference
-        self.odometry = source.odometry
-        self.gravity = source.gravity
-        self.metadata = source.metadata
-        for name in ("imu", "frame_columns"):  # which conversion keeps
-            setattr(self, name, getattr(source, name, None))
-
-    @property
-    def warnings(self) -> list[str]:
-        """See `Source.warnings`."""
-        return self.source.warnings
-
-    def origin(self, index: int) -> tuple[Source, int]:
-        """See `JoinedSource.origin`."""
-        return self.source, index
-
-    def read(self, index: int) -> Frame:
-        """See `Source.read`."""
-        return self._derived(self.source.read(index))
-
-    @abstractmethod
-    def _derived(self, frame: Frame) -> Frame: ...
-
-
-class ScaledSource(_DerivedSource):
+class ScaledSource(DerivedSource):
     """A source in another unit: its depth, or the points and poses of clouds, times a factor."""
 
     def __init__(self, source: Source, factor: float, *, poses: bool) -> None:
@@ -153,7 +121,9 @@ class ScaledSource(_DerivedSource):
                 None if T is None else scale * T for T in (source.reference, source.odometry)
             )
 
-    def _derived(self, frame: Frame) -> Frame:
+    def read(self, index: int) -> Frame:
+        """See `Source.read`."""
+        frame = super().read(index)
         names = ("sigma",) if isinstance(frame, CloudFrame) else _LENGTHS
         lengths: dict[str, Any] = {
             name: (self.factor * image).astype(np.float32)
@@ -175,13 +145,15 @@ class ScaledSource(_DerivedSource):
         )
 
 
-class LimitedSource(_DerivedSource):
+class LimitedSource(DerivedSource):
     """A source restricted to points between two depths in m: z of images, distance in clouds."""
 
     def __init__(self, source: Source, min_depth: float, max_depth: float) -> None:
         super().__init__(source)
         self.min_depth, self.max_depth = min_depth, max_depth
 
-    def _derived(self, frame: Frame) -> Frame:
+    def read(self, index: int) -> Frame:
+        """See `Source.read`."""
+        frame = super().read(index)
         distance = frame.z if isinstance(frame, RangeFrame) else frame.radial_range
         return frame.keep((distance >= self.min_depth) & (distance <= self.max_depth))

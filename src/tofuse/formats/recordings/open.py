@@ -16,7 +16,8 @@ import numpy as np
 from tofuse.engine import quantities
 from tofuse.engine.bounds import Bounds
 from tofuse.engine.errors import InputError, UnreadableFrameError, signals_as_themselves
-from tofuse.engine.frames import NOISE_MODEL, CloudFrame, Frame, RangeFrame, Recording, Source
+from tofuse.engine.frames import CloudFrame, Frame, RangeFrame, Recording, Source
+from tofuse.engine.noise import NOISE_MODEL
 from tofuse.engine.parts import check_number, discover, name_of, registered
 from tofuse.formats.cameras import camera_file, read_noise
 from tofuse.formats.files import reading
@@ -514,23 +515,27 @@ def _reference_of(recording: Recording, path: Path, *, or_odometry: bool) -> Tim
 
 
 @dataclass(frozen=True, kw_only=True)
-class OpeningOptions:
+class ReadingOptions:
+    """Options with which files are read; see `open_recording`."""
+
+    format: str | None = None
+    camera: Path | None = None
+    topic: str | None = None
+    factor: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpeningOptions(ReadingOptions):
     """Options with which a recording is opened.
 
     Attributes
     ----------
-    format, camera, topic, factor
-        See `open_recording`.
     start, end, every
         The selected frames, see `Recording.select`.
     average_still
         Whether stationary intervals are averaged to one frame each.
     """
 
-    format: str | None = None
-    camera: Path | None = None
-    topic: str | None = None
-    factor: float | None = None
     start: int = 0
     end: int | None = None
     every: int = 1
@@ -644,15 +649,9 @@ class SingleView:
 
 
 def open_view(
-    name: str,
-    *,
-    format: str | None = None,  # noqa: A002
-    camera: Path | None = None,
-    topic: str | None = None,
-    factor: float | None = None,
-    file_axes: bool = False,
+    name: str, options: ReadingOptions | None = None, *, file_axes: bool = False
 ) -> SingleView:
-    """Read the view called `name`; for the options see `open_recording`.
+    """Read the view called `name`.
 
     Of a mesh (.ply, .obj, .stl, .glb; m) it is points spread evenly over its area. With `file_axes`
     clouds that the reader turned to the axes of a camera are clouds in those of their file.
@@ -663,11 +662,14 @@ def open_view(
         If there is no such frame, the recording has several and `name` doesn't state which, or the
         frame can't be read or has fewer than ten points.
     """
+    o = options or ReadingOptions()
     path, index = split_name(name)
-    if format is None and index is None and is_surface(Path(path)):
-        points = surface_points(read_surface(Path(path)), path) * (factor or 1.0)
+    if o.format is None and index is None and is_surface(Path(path)):
+        points = surface_points(read_surface(Path(path)), path) * (o.factor or 1.0)
         return _checked(SingleView(name, path, "mesh", 0, CloudFrame.of(points)))
-    recording = open_recording(path, format=format, camera=camera, topic=topic, factor=factor)
+    recording = open_recording(
+        path, format=o.format, camera=o.camera, topic=o.topic, factor=o.factor
+    )
     count = len(recording)
     if index is None and count > 1:
         raise InputError(

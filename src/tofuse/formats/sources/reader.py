@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import ClassVar, Protocol
 
 from tofuse.engine.frames import Source
+from tofuse.formats.files import reading
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,13 @@ class Sniff:
     evidence: str
     remedy: str = ""
     needs_camera: bool = False
+
+    @classmethod
+    def by_camera_file(cls, path: Path, evidence: str, remedy: str) -> Sniff:
+        """Return the guess for a folder of images: certain if it has a camera.json."""
+        if reading.is_file(path / "camera.json"):
+            return cls(1.0, f"{evidence} and camera.json")
+        return cls(cls.UNCERTAIN, evidence, remedy, needs_camera=True)
 
     def with_camera(self) -> Sniff:
         """Return the guess if the user passed a camera; of several the order remains."""
