@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import tofuse
-from cli_calls import printed, refuses
+from cli_calls import call, printed, refuses
 from refused import refused
 from tofuse.apps.jobs.judging import poses_for, sentence
 from tofuse.apps.jobs.pose_scale import with_scale
@@ -250,7 +250,8 @@ def test_command(room_recording, truth, tmp_path, capsys) -> None:
     poses = tmp_path / "poses.txt"
     write_tum(poses, recording.timestamps, bent(truth))
     words = ["judge", str(room_recording), str(poses), "--out", str(tmp_path / "out")]
-    data = json.loads(printed(capsys, *words, "--json"))
+    assert call(*words, "--json") == 3
+    data = json.loads(capsys.readouterr().out)
     assert data["verdict"] == "degraded"
     assert data["out"] == str(tmp_path / "out")
     kept = json.loads((tmp_path / "out/judge.json").read_text())
