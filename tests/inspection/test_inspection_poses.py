@@ -152,6 +152,12 @@ def test_exact_inverse_may_be_either_trajectory():
     assert "if the estimate or the reference holds T_camera_world" in note
 
 
+def test_unrelated_trajectories_are_of_no_other_convention():
+    """Inverted, one of these differs by 25 degrees instead of 83."""
+    steps = np.random.default_rng(487).normal(0, [0.1, 0.03, 0.1, 0.02, 0.3, 0.02], (2, 30, 6))
+    assert difference(*se3.exp(np.cumsum(steps, axis=1))) is None
+
+
 def test_a_slide_is_not_another_scale():
     """The estimate hardly follows a way along a corridor, but its noise is much smaller than it."""
     t = np.linspace(0, 1.6, 20)

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 import tofuse
-from cli_calls import printed, refuses
+from cli_calls import call, printed, refuses
 from refused import refused
+from tofuse.apps.jobs import judging
 from tofuse.apps.jobs.judging import poses_for, sentence
 from tofuse.apps.jobs.pose_scale import with_scale
 from tofuse.apps.results.folders import RESULT
@@ -19,6 +22,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.geometry import se3
 from tofuse.engine.progress import Silent
+from tofuse.engine.quality.pose_accuracy import Accuracy
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.formats.poses.trajectory import write_tum
 from tofuse.formats.recordings import read_reference
@@ -245,12 +249,30 @@ def test_odometry_of_recording_is_judged_where_it_has_no_reference(room_recordin
     refused("has no reference poses", folder, by=read_reference)
 
 
+def test_noise_of_poses_between_those_of_the_sample_counts() -> None:
+    """Between views that are refined, refined poses keep the noise of the given ones."""
+    true = np.tile(np.eye(4), (600, 1, 1))
+    noisy = se3.exp(np.random.default_rng(0).normal(0, [0.02] * 3 + [0.03] * 3, (600, 6)))
+    rows = np.arange(0, 600, 3)
+    refined = judging._propagated(noisy, rows, true[rows])
+    reference = Accuracy(position_m=0.001, rotation_rad=0.001, assessed=True)
+    sampled: Any = SimpleNamespace(
+        diagnostics=SimpleNamespace(accuracy=reference), cloud=SimpleNamespace(diagonal_m=5.0)
+    )
+    distances = judging._distances(noisy, refined)
+    found = judging._accuracy(distances, noisy, refined, rows, None, sampled, np.arange(600))
+    wrong = displacement(true, noisy)
+    assert found.position_m > 0.95 * wrong[0]
+    assert found.rotation_rad > 0.95 * wrong[1]
+
+
 def test_command(room_recording, truth, tmp_path, capsys) -> None:
     recording = tofuse.open(room_recording)
     poses = tmp_path / "poses.txt"
     write_tum(poses, recording.timestamps, bent(truth))
     words = ["judge", str(room_recording), str(poses), "--out", str(tmp_path / "out")]
-    data = json.loads(printed(capsys, *words, "--json"))
+    assert call(*words, "--json") == 3
+    data = json.loads(capsys.readouterr().out)
     assert data["verdict"] == "degraded"
     assert data["out"] == str(tmp_path / "out")
     kept = json.loads((tmp_path / "out/judge.json").read_text())

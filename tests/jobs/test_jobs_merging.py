@@ -21,6 +21,7 @@ from tofuse.apps.jobs.running import exit_status
 from tofuse.apps.jobs.sessions import read_sessions
 from tofuse.apps.report.session_words import session_sentences
 from tofuse.apps.results.folders import OutputFolder
+from tofuse.apps.results.loading import stated_accuracy
 from tofuse.apps.results.output import write_result
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames.frames import CloudFrame
@@ -82,6 +83,14 @@ def test_two_sessions_in_one_room_give_one_map(both) -> None:
     assert error.max() < 0.005
     assert both.diagnostics.verdict == "good"
     assert exit_status(both) == 0
+
+
+def test_corrections_of_the_sessions_count_in_the_bound(both, session_results) -> None:
+    """The poses begin where the refinement of each session has moved them."""
+    stated = [stated_accuracy(session_results[name]).moved_m for name in ("here", "there")]
+    assert min(stated) > 0
+    rms = np.sqrt(np.mean(np.square(stated)))  # as many frames each
+    assert both.diagnostics.accuracy.moved_m == pytest.approx(rms)
 
 
 def test_overlap_and_probability_are_reported(both) -> None:

@@ -76,6 +76,16 @@ def test_no_cause_of_correct_poses_nor_of_unrelated_errors(seed) -> None:
         assert cause_of(deviation(fit, poses), velocity(poses)) is None
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_no_cause_of_poses_of_another_path(seed) -> None:
+    """Neither a jump of a step, as all steps are wrong, nor drift by a whole turn."""
+    truth = walk()
+    fit = fitted(measured(truth, seed=seed, reach=12), DEPTH_M)
+    steps = np.random.default_rng(seed).normal(0, [0.1, 0.03, 0.1, 0.02, 0.2, 0.02], (32, 6))
+    for poses in (truth[::-1], se3.exp(np.cumsum(steps, 0))):
+        assert cause_of(deviation(fit, poses), velocity(poses)) is None
+
+
 def test_large_angles_have_no_exponent() -> None:
     turning = _Hypothesis("turning", np.zeros((2, 6, 3)))
     assert "by 220\N{DEGREE SIGN} in total" in _words(turning, np.array([0, 3.84, 0]), None)

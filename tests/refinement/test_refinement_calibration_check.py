@@ -240,6 +240,14 @@ def test_odometry_contradicts_errors_that_close_a_loop(monkeypatch, lengths, ala
     assert check_calibration(RefinedViews(views, refined, OPTIONS)).alarm
 
 
+def test_views_that_do_not_overlap_show_no_wrong_calibration() -> None:
+    truth = path(12)
+    views = [SampledView.of(s, 1500) for s in surfaces(truth, noise=0.003)]
+    apart = truth.copy()
+    apart[:, 0, 3] += 100.0 * np.arange(12)
+    assert not calibration_check.is_wrong(views, apart, OPTIONS, Priors.none())
+
+
 def test_few_views_determine_nothing_and_say_what_it_would_do():
     views, refined = kept(0.0, views=5)
     found = check_calibration(RefinedViews(views, refined, OPTIONS))

@@ -266,13 +266,15 @@ def judge(arguments: cli.Judge) -> int:
         for name, c in consistencies
         if c is not None
     ]
+    codes = {reason.code for reason in judgement.reasons}
+    contradicted = judgement.verdict == "failed" or "inconsistent_poses" in codes
     return show(
         arguments,
         run_json.plain(judgement.to_dict()),
         *_verdict_lines(judgement.verdict, judgement.reasons),
         escaped(judging.sentence(judgement, arguments.trajectory.name)),
         *([f"map consistency: {'; '.join(texts)}"] if texts else []),
-        status=3 if judgement.verdict == "failed" else 0,
+        status=3 if contradicted else 0,
     )
 
 

@@ -19,6 +19,9 @@ from tofuse.formats.poses import OPENGL
 # remaining one, as a fraction: with another wrong convention, some motions fit too. All within this
 # factor of the best one are named, as about one axis some are the same.
 _MIN_LEAD, _MIN_LEAD_SIGMAS, _MAX_REMAINING, _EQUAL = np.radians(1.5), 4.0, 0.35, 1.5
+# Largest remaining difference of whole trajectories, rad: twice a large drift, and half of what
+# remains by chance between unrelated ones in their best convention.
+_MAX_DIFFERENCE = 0.2
 _ROUNDING = 1e-4  # rad, of poses in text files with few digits
 # Shortest distance from which the scale is estimated, as a fraction of the depth, and cosine of its
 # directions; largest factor that is not reported: devices err by less; and within which of a unit's
@@ -106,7 +109,9 @@ def difference(estimate: Float64, reference: Float64) -> str | None:
         for name, convert in _CONVENTIONS.items()
     }
     best = min(float(error.mean()) for sides in converted.values() for error in sides.values())
-    if as_read.mean() > _MIN_LEAD + best and best <= _MAX_REMAINING * as_read.mean():
+    if as_read.mean() > _MIN_LEAD + best and best <= min(
+        _MAX_REMAINING * as_read.mean(), _MAX_DIFFERENCE
+    ):
         ifs = []
         for name, sides in converted.items():
             fit = [

@@ -248,7 +248,9 @@ def judge(
         )
     sampled = refined.result
     distances = _distances(poses, refined.poses)
-    accuracy = _accuracy(distances, poses, refined.poses, deviation, sampled, recording.indices)
+    accuracy = _accuracy(
+        distances, poses, refined.poses, images.rows, deviation, sampled, recording.indices
+    )
     stated = _stated_accuracy(trajectory)
     if stated is not None and _holds(stated, accuracy, sampled.diagnostics.accuracy, deviation):
         accuracy = stated
@@ -654,6 +656,7 @@ def _accuracy(
     distances: Float64,
     poses: Float64,
     refined_poses: Float64,
+    rows: Intp,
     deviation: pose_deviation.Deviation | None,
     refined: Reconstruction,
     indices: Intp,
@@ -662,13 +665,21 @@ def _accuracy(
 
     Unless images contradict the poses, that distance may be an error of either, and is independent
     of the bound of the refined ones. Otherwise both may have the same direction: the refinement
-    began with the wrong poses.
+    began with the wrong poses. Between the `rows` of the sample, refined poses follow the given
+    ones, whose noise shows only at these.
     """
     reference = refined.diagnostics.accuracy
     common = np.flatnonzero(np.isfinite(distances))
     if not reference.assessed or not len(common):
         return reference
-    moved = np.array(trajectory_errors.displacement(refined_poses[common], poses[common]))
+    moved = np.max(
+        [
+            trajectory_errors.displacement(refined_poses[some], poses[some])
+            for some in (common, np.intersect1d(common, rows))
+            if len(some)
+        ],
+        axis=0,
+    )
     stated = np.array([reference.position_m, reference.rotation_rad])
     consistent = deviation is not None and deviation.consistent
     position, rotation = (np.hypot(moved, stated) if consistent else moved + stated).tolist()

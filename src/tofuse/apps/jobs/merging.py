@@ -117,6 +117,8 @@ def merged_config(sessions: Sequence[Session]) -> Config:
     if apart > search.roll:
         search = replace(search, roll=min(search.roll + apart, np.pi))
     searches = _SEARCHES * (len(sessions) - 1)
+    moved = [_given_poses(s).moved_m for s in sessions for _ in s.posed]
+    moved_m = float(np.sqrt(np.mean(np.square(moved)))) if moved else 0.0
     joining = replace(
         default.joining,
         main="first",
@@ -129,7 +131,7 @@ def merged_config(sessions: Sequence[Session]) -> Config:
         corrections=first.corrections,
         filters=first.filters,
         model_filters=first.model_filters,
-        odometry=first.odometry,
+        odometry=replace(_given_poses(sessions[0]), moved_m=moved_m),
         fusion=first.fusion,
         tolerance_m=first.tolerance_m,
         priors=tuple(priors.values()) if all(s.config.priors for s in sessions) else (),
@@ -137,6 +139,12 @@ def merged_config(sessions: Sequence[Session]) -> Config:
         search=search,
         self_calibration=False,  # done for each session
     )
+
+
+def _given_poses(session: Session) -> given.GivenPoses:
+    odometry = session.config.odometry
+    assert isinstance(odometry, given.GivenPoses)
+    return odometry
 
 
 def merge_sessions(
@@ -161,8 +169,7 @@ def merge_sessions(
     progress.stage("reading sessions", len(recording))
     with threadpool_limits(1):
         for session, offset in zip(sessions, offsets, strict=True):
-            odometry = session.config.odometry
-            assert isinstance(odometry, given.GivenPoses)
+            odometry = _given_poses(session)
             stated = {k + offset: pose for k, pose in session.stated.items()}
             mapper.interrupt(replace(session.config, odometry=given.StatedPoses(stated, odometry)))
             session_recording = replace(recording, indices=session.recording.indices + offset)

@@ -11,7 +11,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from tofuse.apps.results import folders, reopening, run_json
+from tofuse.apps.results import folders, reopening, run_json, stated_accuracy
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Recording
@@ -173,7 +173,9 @@ def _session(
             where=folder,
             remedy="pass their clouds together to one `tofuse run`",
         )
-    config = with_given_poses(reopening.stored_config(part, folder))
+    config = with_given_poses(
+        reopening.stored_config(part, folder), stated_accuracy(folder).moved_m
+    )
     config = adaptation.adapted(config, recording, threads, progress)
     recording, config = adaptation.with_known_odometry(recording, config, odometry_scale)
     opening = reopening.locate_recording(part.opening, folder)
@@ -211,12 +213,15 @@ def _poses(folder: Path, run: dict[str, Any]) -> dict[int, Float64]:
     return dict(zip(*run_json.main_poses(folder, run), strict=True))
 
 
-def with_given_poses(config: Config) -> Config:
-    """Return a configuration that adopts given poses, and prepares images as before."""
-    given_poses = given.GivenPoses()
+def with_given_poses(config: Config, moved_m: float = 0.0) -> Config:
+    """Return a configuration that adopts given poses, and prepares images as before.
+
+    A refinement moved them by `moved_m` rms.
+    """
+    given_poses = given.GivenPoses(moved_m=moved_m)
     if isinstance(odometry := config.odometry, Keyframes | given.GivenPoses):
         given_poses = given.GivenPoses(
-            odometry.views, odometry.keyframe_angle, odometry.keyframe_distance
+            odometry.views, odometry.keyframe_angle, odometry.keyframe_distance, moved_m
         )
     return replace(config, odometry=given_poses)
 

@@ -298,8 +298,11 @@ class Assessment:
     ) -> pose_accuracy.ObservedErrors:
         """Return the errors of the poses that their covariances don't include."""
         refinement, corrections = refined.refinement, self._estimated_corrections
-        moved = 0.0, 0.0
-        if self._is_tracked:  # the initial error of given poses is unrelated to the final one
+        odometry = self.config.odometry
+        if isinstance(odometry, given.GivenPoses):
+            # Their initial error is unrelated to the final one, but not to that of an earlier run.
+            moved = odometry.moved_m, 0.0
+        else:
             moved = trajectory_errors.displacement(
                 closed.optimisation.graph.poses, refined.graph.poses
             )

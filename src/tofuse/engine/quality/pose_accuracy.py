@@ -125,6 +125,11 @@ class Accuracy:
         """The cause of most of the bound of the positions; empty if they are not bounded."""
         return max(self.causes_m, key=self.causes_m.__getitem__, default="")
 
+    @property
+    def moved_m(self) -> float:
+        """Rms by which the refinement moved the positions, m; 0 if they are not bounded."""
+        return self.causes_m.get("refinement", 0.0) / float(np.sqrt(UNKNOWN_FRACTION))
+
     def without_bound(self) -> Accuracy:
         """Return the accuracy where an error is known that its evidence does not cover."""
         return replace(

@@ -14,8 +14,9 @@ criterion (Schwarz 1978), of which a Q of correct poses is the minimum.
 | drift | steps wrong in proportion to their length | 6 |
 | jump | all poses from a view on, rigidly | 6, and the view |
 
-A cause is named only if it explains most of the contradiction, and is far more probable than no
-common cause and than any other.
+A cause is named only if it explains most of the contradiction, is far more probable than no common
+cause and than any other, and is small enough for linear errors. A jump must be that of one step:
+steps that are all wrong resemble it, too.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ _OVER_NONE, _OVER_OTHERS = 10.0, 6.0
 _MIN_SIDE = 3
 # Fraction of the contradiction that a cause explains.
 _MOST = 2 / 3
+# Largest rotation whose effect is about linear, rad. Error of the step of a jump, relative to that.
+_MAX_ANGLE, _MAX_STEP_ERROR = 1.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -131,12 +134,26 @@ def cause_of(found: Deviation, velocity: Float64) -> Cause | None:
         criterion(total, 0) - best < _OVER_NONE
         or min(others) - best < _OVER_OTHERS
         or explained < _MOST
+        or not _is_possible(found, hypothesis, theta)
     ):
         return None
     frames = None
     if hypothesis.kind == "jump":
         frames = (int(graph.ids[hypothesis.view - 1]), int(graph.ids[hypothesis.view]))
     return Cause(hypothesis.kind, _words(hypothesis, theta, frames), explained, frames)
+
+
+def _is_possible(found: Deviation, hypothesis: _Hypothesis, theta: Float64) -> bool:
+    """Whether errors with parameters (p,) are about linear, and those of a jump are of one step."""
+    if hypothesis.kind != "jump":
+        return len(theta) == 1 or bool(np.linalg.norm(theta[-3:]) < _MAX_ANGLE)
+    around = slice(hypothesis.view - 1, hypothesis.view + 1)
+    fitted = found.fit.graph.poses[around]
+    given = fitted @ se3.exp(found.errors[around])
+    step, given_step = (se3.inverse(T[0]) @ T[1] for T in (fitted, given))
+    units = np.array([1.0] * 3 + [found.fit.depth_m] * 3)
+    remaining = units * (se3.log(se3.inverse(step) @ given_step) - theta)
+    return bool(np.linalg.norm(remaining) < _MAX_STEP_ERROR * np.linalg.norm(units * theta))
 
 
 def _hypotheses(found: Deviation, velocity: Float64) -> Iterator[_Hypothesis]:

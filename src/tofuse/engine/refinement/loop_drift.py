@@ -46,7 +46,7 @@ def thinned(
     The errors of patches are not modelled, and `rounds` are coarse to fine.
     """
     count = len(pairs) * options.points
-    stride = min(-(-count // _MAX_POINTS), _MAX_STRIDE)
+    stride = min(max(-(-count // _MAX_POINTS), 1), _MAX_STRIDE)
     if count > stride * _MAX_POINTS:
         pairs = spread_evenly(pairs, -(-options.neighbours * stride * _MAX_POINTS // count))
     thinned_options = replace(

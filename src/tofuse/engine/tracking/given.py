@@ -38,11 +38,14 @@ class GivenPoses(Bounded, Odometry):
         How images are prepared and aligned.
     keyframe_angle, keyframe_distance
         Motion after which a frame becomes a keyframe: rad, and as a fraction of the median depth.
+    moved_m
+        Rms by which an earlier refinement moved the positions, m: the bound allows for it again.
     """
 
     views: ViewOptions = ViewOptions()  # noqa: RUF009 - immutable
     keyframe_angle: Annotated[float, Bounds(0, exclusive=True)] = 0.2
     keyframe_distance: Annotated[float, Bounds(0, exclusive=True)] = 0.1
+    moved_m: Annotated[float, Bounds(0)] = 0.0
 
     takes: ClassVar[frozenset[str]] = frozenset({"range"})
 
