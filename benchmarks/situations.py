@@ -166,6 +166,7 @@ def _changing() -> Iterator[tuple[str, Callable[[int], Take]]]:
             f"range grows by {metres:g} m",
             _numbered(lambda f, at, m=metres: stress.farther(f, m * at)),
         )
+    yield "range grows by 0.1 m, flat", _numbered(lambda f, at: stress.farther(f, 0.1 * at), flat)
     yield (
         "focal length x 1.05 in the second half",
         _numbered(lambda f, at: stress.lens_off(f, fx=1.05, fy=1.05) if at > 0.5 else f),

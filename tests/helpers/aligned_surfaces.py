@@ -25,12 +25,13 @@ def path(count: int) -> np.ndarray:
 
 
 def surfaces(poses, noise=0.0, *, bias=0.0, **kwargs):
-    """Views with noise, and a bias (H, W) fixed to the camera, in m."""
+    """Views with noise, and a bias (H, W) fixed to the camera, or (N, 1, 1) of each view, in m."""
     rng = np.random.default_rng(3)
+    of_view = bias if np.ndim(bias) == 3 else [bias] * len(poses)
     out = []
     for k, T in enumerate(poses):
         frame = replace(corner(T, **kwargs), index=k)
-        depth = frame.depth + bias + noise * rng.standard_normal(frame.depth.shape)
+        depth = frame.depth + of_view[k] + noise * rng.standard_normal(frame.depth.shape)
         out.append(prepare_view(replace(frame, depth=depth.astype(np.float32)), SHARP))
     return out
 

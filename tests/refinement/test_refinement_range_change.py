@@ -60,6 +60,23 @@ def test_drift_of_range_is_found(right: list[SampledView]) -> None:
     assert "drifts" in found.in_words()
 
 
+@pytest.mark.parametrize("at_start", [0.0, 0.03])
+def test_warming_up_is_found(at_start: float) -> None:
+    """Also if an offset, which the views show too, explains the mean of the drift."""
+    offsets = at_start + np.linspace(0.0, 0.06, VIEWS)
+    farther = surfaces(path(VIEWS), noise=0.003, bias=offsets[:, None, None])
+    warming = [SampledView.of(surface, 1500) for surface in farther]
+    refined = refine(warming, path(VIEWS), OPTIONS)
+    check = check_calibration(RefinedViews(warming, refined, OPTIONS))
+    found = check.range_change
+    assert found is not None
+    assert found.frame is None
+    assert found.in_metres
+    assert found.change == pytest.approx(0.06, rel=0.3)
+    assert "drifts by about" in found.in_words()
+    assert not check.alarm
+
+
 @pytest.mark.parametrize("scales", [(1.0, 1.03), (1.03, 1.0)])
 def test_recording_of_another_scale_is_found(right: list[SampledView], scales) -> None:
     found = checked(right, np.repeat(scales, VIEWS // 2), recordings=2).range_change

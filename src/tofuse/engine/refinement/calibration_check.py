@@ -14,7 +14,7 @@ A camera whose range changes has no single calibration: see `range_change`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -25,7 +25,14 @@ from tofuse.engine.arrays import Float64
 from tofuse.engine.compute import run_all
 from tofuse.engine.geometry import se3
 from tofuse.engine.quantities import length, percent
-from tofuse.engine.refinement.camera_response import SECTIONS, SIGNIFICANT, Linearised, Posterior
+from tofuse.engine.refinement.camera_response import (
+    SECTIONS,
+    SIGNIFICANT,
+    Linearised,
+    Posterior,
+    SharedErrors,
+    significance_of,
+)
 from tofuse.engine.refinement.joint_alignment import (
     AlignedViews,
     Priors,
@@ -35,7 +42,13 @@ from tofuse.engine.refinement.joint_alignment import (
     overlapping,
 )
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, Gap, Loop, loop_gap, thinned
-from tofuse.engine.refinement.range_change import RangeChange, likely_change, range_change
+from tofuse.engine.refinement.range_change import (
+    RangeChange,
+    drifts_of,
+    likely_change,
+    range_change,
+    recording_of,
+)
 from tofuse.engine.refinement.split_half import rms_motion
 from tofuse.engine.stored_views import SampledView, pair_equations
 from tofuse.engine.stored_views import pair_equation_kernels as kernels
@@ -54,6 +67,8 @@ QUANTITIES = {
 # Standard deviation of the errors of usual cameras, uniform up to the tolerance, which is the same
 # for all; and of one that is not usual.
 USUAL, _UNUSUAL = 0.01 / 3**0.5, 0.1
+# The scale of a usual camera does not drift: its clock is stable.
+_NONE = 1e-6
 # Logarithm of the factor by which views are likelier with an error: strong evidence (Jeffreys).
 _STRONG = float(np.log(10))
 # Standard deviations by which a certain error exceeds the tolerance; and of a usual one that may
@@ -241,6 +256,9 @@ def is_wrong(
 class _Estimate:
     """Joint estimate of all errors, in the order of `_INDEX`, by linearised views.
 
+    After them follow drifts of the range, by a distance, as while a camera warms up, then by a
+    factor: one of the other errors may explain the mean of a drift.
+
     Attributes
     ----------
     poses
@@ -253,6 +271,8 @@ class _Estimate:
         Factor of the priors of the errors in reweighted least squares.
     unusual
         Name of the error that is not usual, empty if all are.
+    drift
+        A drift by a distance that is not usual, if one is far likelier, beside that error.
     """
 
     poses: Float64
@@ -261,23 +281,29 @@ class _Estimate:
     follow: Float64
     prior_weight: float
     unusual: str
+    drift: RangeChange | None
 
     @classmethod
     def of(cls, linearised: Linearised) -> _Estimate:
         """Estimate all errors."""
-        shared = linearised.shared_errors(list(_INDEX.values()))
-        models = {name: shared.posterior(_sigmas(name)) for name in ("", *_INDEX)}
+        views = linearised.state.views
+        drifts = drifts_of(views)
+        shared = linearised.shared_errors(list(_INDEX.values()), drifts)
+        usual_drifts = np.repeat([USUAL, _NONE], len(drifts))
+        usual = {name: np.append(_sigmas(name), usual_drifts) for name in ("", *_INDEX)}
+        models = {name: shared.posterior(sigmas) for name, sigmas in usual.items()}
         best = max(models, key=lambda name: models[name].evidence)
+        drift = _likely_drift(shared, usual.values(), models[best].evidence, drifts, linearised)
         if models[best].evidence - models[""].evidence < _STRONG:
             best = ""
         weight = shared.dispersion / linearised.curvature
-        return cls(linearised.poses, models[best], models[""], shared.motion, weight, best)
+        return cls(linearised.poses, models[best], models[""], shared.motion, weight, best, drift)
 
     @property
     def by_name(self) -> dict[str, tuple[float, float]]:
         """Errors and their standard deviations."""
         sigmas = np.sqrt(np.diag(self.found.covariance)).tolist()
-        return dict(zip(_INDEX, zip(self.found.errors.tolist(), sigmas, strict=True), strict=True))
+        return dict(zip(_INDEX, zip(self.found.errors.tolist(), sigmas, strict=True), strict=False))
 
     @property
     def is_promising(self) -> bool:
@@ -290,7 +316,7 @@ class _Estimate:
     @property
     def motion(self) -> dict[str, tuple[float, float]]:
         """See `CalibrationCheck.motion`."""
-        return {name: self._motion(np.eye(len(_INDEX))[k]) for k, name in enumerate(_INDEX)}
+        return {name: self._motion(np.eye(len(self.follow))[k]) for k, name in enumerate(_INDEX)}
 
     @property
     def moved(self) -> Float64:
@@ -315,6 +341,44 @@ class _Estimate:
         return m / _DELTA * size, rad / _DELTA * size
 
 
+def _likely_drift(
+    shared: SharedErrors,
+    usual: Iterable[Float64],
+    evidence: float,
+    drifts: Float64,
+    linearised: Linearised,
+) -> RangeChange | None:
+    """Return the likeliest of drifts (D, N) that is not usual; None without strong evidence.
+
+    And if it is by a factor. `usual` are the standard deviations (K,) of models without one, and
+    `evidence` of the likeliest.
+    """
+    best: tuple[Posterior, int] | None = None
+    for sigmas in usual:
+        for k in range(len(_INDEX), len(sigmas)):
+            unusual = np.where(np.arange(len(sigmas)) == k, _UNUSUAL, sigmas)
+            found = shared.posterior(unusual)
+            if found.evidence > (evidence + _STRONG if best is None else best[0].evidence):
+                best = found, k
+    if best is None or best[1] >= len(_INDEX) + len(drifts):
+        return None
+    found, k = best
+    views = linearised.state.views
+    first = views[int(drifts[k - len(_INDEX)].argmax())]
+    # What poses have not taken up of a large drift is no noise: the weights stay as they are.
+    step = linearised.curvature
+    chance = significance_of(shared.independent[k]) * shared.serial_sigma[k]
+    return RangeChange(
+        -step * float(found.errors[k]),
+        step * float(np.sqrt(found.covariance[k, k])),
+        frame=None,
+        limit=_CERTAIN,
+        confirmed=bool(abs(found.errors[k]) > chance),
+        recording=recording_of(first, views),
+        in_metres=True,
+    )
+
+
 def _by_first_estimate(
     aligned: RefinedViews, linearised: Linearised, first: _Estimate
 ) -> CalibrationCheck:
@@ -327,6 +391,8 @@ def _by_first_estimate(
         moved=rms_motion(first.poses, first.moved),
         spread=first.spread,
     )
+    if first.drift is not None and first.drift.is_large:
+        return replace(check, range_change=first.drift)
     change = likely_change(linearised)
     if change is None:
         return check
@@ -404,7 +470,7 @@ class _Estimator:
         if np.abs(first.found.errors).max() > _MAX_DIRECT * max(TOLERANCES.values()):
             options = replace(options, rounds=COARSE_TO_FINE)
         else:
-            errors[calibrate], poses = first.found.errors, first.moved
+            errors[calibrate], poses = first.found.errors[: len(calibrate)], first.moved
         return self._align(poses, options, calibrate=calibrate, errors=errors, usual=usual)
 
     def support_of(self, estimate: AlignedViews) -> tuple[float, float]:

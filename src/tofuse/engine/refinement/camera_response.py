@@ -76,23 +76,12 @@ class Response:
         """Return standard deviations and effective numbers of views (K,) of profiles over time.
 
         As `sigma` and `informative_views`, but for views whose errors resemble those of the views
-        before and after, as with multipath, which changes from room to room: with the
-        autocovariances up to a lag that follows from that of the next view (Newey and West 1987;
-        Andrews 1991, equation 6.2), which also reduces the number of independent views.
-        Arguments as of `sigma`; the views are in the order of time.
+        before and after, as with multipath, which changes from room to room. Arguments as of
+        `sigma`; the views are in the order of time.
         """
-        v = self._of_views(pairs, view_count)
-        variance = np.maximum((v**2).sum(0), 1e-24)
-        next_one = ((v[1:] * v[:-1]).sum(0) / variance).clip(0, _MAX_CORRELATION)
-        alpha = (2 * next_one / (1 - next_one**2)) ** 2
-        # Weights decrease from 1 at lag 0 to 0 at this one; with white noise no lag counts.
-        width = np.minimum(np.maximum(1.1447 * (alpha * view_count) ** (1 / 3), 1), view_count)
-        total = variance.copy()
-        for lag in range(1, view_count):
-            total += 2 * np.maximum(1 - lag / width, 0) * (v[lag:] * v[:-lag]).sum(0)
-        independent = self.informative_views(pairs, view_count) * np.minimum(1.5 / width, 1)
-        sigma = self._sigma(np.maximum(total, variance), view_count)
-        return sigma, np.asarray(independent, np.float64)
+        variance, independent = _serial(self._of_views(pairs, view_count))
+        informative = self.informative_views(pairs, view_count)
+        return self._sigma(variance, view_count), informative * independent
 
     def _of_views(self, pairs: Intp, view_count: int) -> Float64:
         """(N, K) gradients of the views at the estimates."""
@@ -106,9 +95,7 @@ class Response:
 
     def informative_views(self, pairs: Intp, view_count: int) -> Float64:
         """(K,) effective number of views that determine each error; arguments as of `sigma`."""
-        information = np.maximum(_by_view(self.information, pairs, view_count), 0.0)
-        squares = np.maximum((information**2).sum(0), 1e-24)
-        return np.asarray(information.sum(0) ** 2 / squares, np.float64)
+        return _informative(_by_view(self.information, pairs, view_count))
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +132,9 @@ class SharedErrors:
         views; multipath, mixed pixels and periodic errors between sections of the images.
     motion
         (K, N, 6) twist by which each pose follows, per unit of each error.
+    serial_sigma, independent
+        (K,) standard deviation of each estimate, and effective number of views, if the errors of
+        views resemble those of the views before and after, see `Response.serial`.
     """
 
     initial: Float64
@@ -152,6 +142,8 @@ class SharedErrors:
     information: Float64
     dispersion: float
     motion: Float64
+    serial_sigma: Float64
+    independent: Float64
 
     def posterior(self, sigmas: Float64) -> Posterior:
         """Return the posterior of the errors, given standard deviations (K,) before the views."""
@@ -163,6 +155,31 @@ class SharedErrors:
         cost = step @ (0.5 * information @ step + gradient) + 0.5 * errors @ prior @ errors
         volume = 0.5 * np.linalg.slogdet(covariance)[1] - np.log(sigmas).sum()
         return Posterior(errors, np.asarray(covariance, np.float64), float(volume - cost))
+
+
+def _informative(information: Float64) -> Float64:
+    """Return the effective number (K,) of views with information (N, K)."""
+    information = np.maximum(information, 0.0)
+    squares = np.maximum((information**2).sum(0), 1e-24)
+    return np.asarray(information.sum(0) ** 2 / squares, np.float64)
+
+
+def _serial(v: Float64) -> tuple[Float64, Float64]:
+    """Return the variances (K,) of the sums of series (N, K) whose values resemble the next ones.
+
+    With the autocovariances up to a lag that follows from that of the next value (Newey and West
+    1987; Andrews 1991, equation 6.2); and the fractions (K,) of the values that are independent.
+    """
+    count = len(v)
+    variance = np.maximum((v**2).sum(0), 1e-24)
+    next_one = ((v[1:] * v[:-1]).sum(0) / variance).clip(0, _MAX_CORRELATION)
+    alpha = (2 * next_one / (1 - next_one**2)) ** 2
+    # Weights decrease from 1 at lag 0 to 0 at this one; with white noise no lag counts.
+    width = np.minimum(np.maximum(1.1447 * (alpha * count) ** (1 / 3), 1), count)
+    total = variance.copy()
+    for lag in range(1, count):
+        total += 2 * np.maximum(1 - lag / width, 0) * (v[lag:] * v[:-lag]).sum(0)
+    return np.maximum(total, variance), np.minimum(1.5 / width, 1)
 
 
 def _scatter(gradients: Float64) -> Float64:
@@ -262,9 +279,16 @@ class Linearised:
         curvature = tukey.consistency(projective.ROBUST)
         return cls(state, poses, errors, system, T_i_j, H, g, factor, curvature)
 
-    def shared_errors(self, errors: Sequence[int]) -> SharedErrors:
-        """Return the equations of errors, by their numbers in `kernels`."""
+    def shared_errors(self, errors: Sequence[int], changes: Float64 | None = None) -> SharedErrors:
+        """Return the equations of errors, by their numbers in `kernels`.
+
+        And, after them, of offsets and of scales that change over the views by profiles (D, N).
+        """
         columns = np.tile(np.eye(kernels.ERRORS)[:, errors], (len(self.H), 1, 1))
+        if changes is not None:
+            offsets = self._changing(changes, kernels.SOURCE_OFFSET, kernels.OFFSET)
+            scales = self._changing(changes, kernels.SOURCE_SCALE, kernels.SCALE)
+            columns = np.concatenate([columns, offsets, scales], 2)
         motion, along = self._along(columns)
         first, second = self._derivatives(self.H, self.g, along)
         gradient = first.sum(0)
@@ -277,12 +301,25 @@ class Linearised:
             weight * float(np.trace(np.linalg.solve(information, _scatter(gradients))))
             for weight, gradients in ((0.5, of_views), (1.0, of_sections))
         ) / len(information)
-        initial = self.errors[list(errors)]
-        return SharedErrors(initial, gradient, information, max(dispersion, 1.0), motion)
+        initial = np.append(self.errors[list(errors)], np.zeros(len(gradient) - len(errors)))
+        count = len(self.poses)
+        variance, independent = _serial(of_views @ np.linalg.inv(information))
+        informative = np.diagonal(second, axis1=1, axis2=2)
+        informative = _informative(_by_view(informative, self.state.pairs, count))
+        return SharedErrors(
+            initial,
+            gradient,
+            information,
+            max(dispersion, 1.0),
+            motion,
+            np.sqrt(variance * count / max(count - 1, 1)),
+            informative * independent,
+        )
 
     def response_to_scales(self, profiles: Float64) -> Response:
         """Return the response to the scale of the depth by profiles (K, N) over the views."""
-        motion, along = self._along(self._scales(profiles))
+        scales = self._changing(profiles, kernels.SOURCE_SCALE, kernels.SCALE)
+        motion, along = self._along(scales)
         first, second = self._derivatives(self.H, self.g, along)
         return Response(first, np.diagonal(second, axis1=1, axis2=2), motion)
 
@@ -303,13 +340,16 @@ class Linearised:
         half = len(first) // 2
         return first[:half] + first[half:], self.curvature * (second[:half] + second[half:])
 
-    def _scales(self, profiles: Float64) -> Float64:
-        """Return errors (P, ERRORS, K) of the directed pairs: scales by profiles (K, N)."""
+    def _changing(self, profiles: Float64, of_source: int, of_all: int) -> Float64:
+        """Return errors (P, ERRORS, K) of the directed pairs that change by profiles (K, N).
+
+        `of_source` is the number of the error of the source view alone, `of_all` of all views.
+        """
         columns = np.zeros((len(self.H), kernels.ERRORS, len(profiles)))
         of_target = profiles[:, self.state.target].T
-        # The response to the scale of the target is the remainder of that to a common one.
-        columns[:, kernels.SOURCE_SCALE] = profiles[:, self.state.source].T - of_target
-        columns[:, kernels.SCALE] = of_target
+        # The response to the error of the target is the remainder of that to a common one.
+        columns[:, of_source] = profiles[:, self.state.source].T - of_target
+        columns[:, of_all] = of_target
         return columns
 
     def section_sigma(self, profile: Float64) -> float:
@@ -318,7 +358,7 @@ class Linearised:
         An error that differs over the image is no change of the range, though with steady motion
         views drift apart by it: what enters on one side leaves on the other.
         """
-        _, along = self._along(self._scales(profile))
+        _, along = self._along(self._changing(profile, kernels.SOURCE_SCALE, kernels.SCALE))
         first, second = (x.sum(0) for x in self._derivatives(self.H, self.g, along))
         scatter = _scatter(self._of_sections(along, -first / second[0]))
         return float(np.sqrt(scatter[0, 0]) / max(second[0, 0], 1e-12))

@@ -17,6 +17,7 @@ import numpy as np
 
 from tofuse.engine.arrays import Float64
 from tofuse.engine.geometry import se3
+from tofuse.engine.quantities import length
 from tofuse.engine.refinement.camera_response import SECTIONS, Linearised, significance_of
 from tofuse.engine.refinement.joint_alignment import RefinedViews, align_views
 from tofuse.engine.refinement.loop_drift import COARSE_TO_FINE, thinned
@@ -57,6 +58,8 @@ class RangeChange:
         which steady motion looks like a drift.
     recording
         Indices of the first and the last view of the recording that changes, if several are joined.
+    in_metres
+        Whether the range changes by a distance, in m, and not relatively.
     """
 
     change: float
@@ -66,6 +69,7 @@ class RangeChange:
     confirmed: bool = True
     in_all_sections: bool = True
     recording: tuple[int, int] | None = None
+    in_metres: bool = False
 
     @property
     def is_significant(self) -> bool:
@@ -80,7 +84,8 @@ class RangeChange:
 
     def in_words(self) -> str:
         """Describe the change."""
-        by, where = f"by {100 * self.change:+.1f} %", "the recording"
+        amount = f"about {length(self.change)}" if self.in_metres else f"{100 * self.change:+.1f} %"
+        by, where = f"by {amount}", "the recording"
         if self.recording is not None:
             where = "frames {} to {}".format(*self.recording)
             if self.frame == self.recording[0]:
@@ -131,9 +136,10 @@ def likely_change(linearised: Linearised) -> LikelyChange | None:
     """
     views, pairs = linearised.state.views, linearised.state.pairs
     count = len(views)
-    drifts, steps = _candidates(views)
+    steps = _steps(views)
     if not len(steps):
         return None
+    drifts = drifts_of(views)
     best = int(np.argmax(linearised.scale_scores(steps)))
     profiles = np.concatenate([drifts, steps[best, None]])
     found = linearised.response_to_scales(profiles)
@@ -146,29 +152,43 @@ def likely_change(linearised: Linearised) -> LikelyChange | None:
     limit = significance_of(float(found.informative_views(pairs, count)[k]), tests=count)
     first = views[int(profiles[k].argmax())]
     frame = None if k < len(drifts) else first.index
-    of = [view.index for view in views if view.recording == first.recording]
-    recording = None if len(of) == count else (of[0], of[-1])
+    recording = recording_of(first, views)
     return LikelyChange(
         float(scales[k]), float(sigmas[k]), profiles[k], found.motion[k], frame, recording, limit
     )
 
 
-def _candidates(views: Sequence[SampledView]) -> tuple[Float64, Float64]:
-    """Return the profiles of drifts (D, N) and steps (S, N), each of one recording."""
+def recording_of(view: SampledView, views: Sequence[SampledView]) -> tuple[int, int] | None:
+    """Indices of the first and the last view of a view's recording; None if that is of all."""
+    of = [other.index for other in views if other.recording == view.recording]
+    return None if len(of) == len(views) else (of[0], of[-1])
+
+
+def drifts_of(views: Sequence[SampledView]) -> Float64:
+    """Return the profiles (D, N) of drifts from 0 to 1, each of one recording."""
     index = np.array([view.index for view in views], float)
     recording = np.array([view.recording for view in views])
-    drifts, steps = [np.zeros((0, len(views)))], [np.zeros((0, len(views)))]
+    drifts = [np.zeros((0, len(views)))]
+    for number in np.unique(recording):
+        own = recording == number
+        if own.sum() >= 2 * _MIN_VIEWS:
+            since = np.where(own, index - index[own][0], 0.0)
+            drifts.append(since[None] / max(float(since.max()), 1.0))
+    return np.concatenate(drifts)
+
+
+def _steps(views: Sequence[SampledView]) -> Float64:
+    """Return the profiles (S, N) of steps from 0 to 1, each of one recording."""
+    recording = np.array([view.recording for view in views])
+    steps = [np.zeros((0, len(views)))]
     for number in np.unique(recording):
         own = recording == number
         position = np.where(own, np.cumsum(own), 0)[None]  # 1, 2, ... in the recording
-        since = np.where(own, index - index[own][0], 0.0)
         first_after = np.arange(_MIN_VIEWS, own.sum() - _MIN_VIEWS + 1)[:, None] + 1
-        if len(first_after):
-            drifts.append(since[None] / max(float(since.max()), 1.0))
         steps.append((position >= first_after).astype(float))
         if number != recording[0] and own.sum() >= _MIN_VIEWS:
             steps.append((position >= 1).astype(float))
-    return np.concatenate(drifts), np.concatenate(steps)
+    return np.concatenate(steps)
 
 
 def range_change(likely: LikelyChange, aligned: RefinedViews) -> RangeChange | None:

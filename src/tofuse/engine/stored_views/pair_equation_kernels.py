@@ -33,7 +33,8 @@ CENTER_X = 3  # to be added to the x / z of distorted rays: principal point over
 CENTER_Y = 4  # to be added to their y / z
 DISTORTION = 5  # relative, times x^2 + y^2 of the ray coordinates, to be added to these
 SOURCE_SCALE = 6  # as SCALE, but of the source view alone: to be estimated, not assumed
-ERRORS = 7
+SOURCE_OFFSET = 7  # as OFFSET, likewise
+ERRORS = 8
 
 EXPOSURE = 6  # index of the exposure among the unknowns
 UNKNOWNS = 7 + ERRORS
@@ -406,9 +407,9 @@ def _respond_to_errors(
         steep_q = bend_q * across_q / max(qz * qz, tiny) + longer_q * kept_q
         center_p = pz / projection_kernels.distortion(rho2_p, lens)
         center_q = qz / projection_kernels.distortion(rho2_q, lens)
-        block[(_RESPONSE + OFFSET) * residual.LANES + k] = along_p / np.sqrt(
-            p2
-        ) - range_q * along_q / np.sqrt(q2)
+        nearer_p, nearer_q = along_p / np.sqrt(p2), range_q * along_q / np.sqrt(q2)
+        block[(_RESPONSE + OFFSET) * residual.LANES + k] = nearer_p - nearer_q
+        block[(_RESPONSE + SOURCE_OFFSET) * residual.LANES + k] = nearer_p
         block[(_RESPONSE + SCALE) * residual.LANES + k] = along_p - range_q * along_q
         block[(_RESPONSE + SOURCE_SCALE) * residual.LANES + k] = along_p
         block[(_RESPONSE + FOCAL) * residual.LANES + k] = longer_p * scaled_p - longer_q * scaled_q
