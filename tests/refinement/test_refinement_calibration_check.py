@@ -164,7 +164,8 @@ def test_errors_that_resemble_each_other_are_told_apart_together():
 def test_one_unusual_error_is_likelier_than_several() -> None:
     """Two errors have nearly the same effect, and the views show their sum."""
     effect = np.array([[1.0, 0.99], [0.99, 1.0]]) / 0.003**2
-    shared = SharedErrors(np.zeros(2), effect @ [-0.03, -0.02], effect, 1.0, np.zeros((2, 1, 6)))
+    motion, serial = np.zeros((2, 1, 6)), (np.full(2, 0.003), np.ones(2))
+    shared = SharedErrors(np.zeros(2), effect @ [-0.03, -0.02], effect, 1.0, motion, *serial)
     usual = np.full(2, USUAL)
     both, first, second = (
         shared.posterior(np.where(np.arange(2) == k, 0.1, usual)) for k in (-1, 0, 1)

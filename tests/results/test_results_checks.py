@@ -23,7 +23,7 @@ from tofuse.engine.refinement.refinement import Refinement
 from tofuse.engine.results import checks
 from tofuse.engine.results.checks import Evidence, judge
 from tofuse.engine.results.types import Component, FrameRecord, Reason
-from tofuse.engine.results.verdicts import REASONS, ranked, remedy, verdict_of
+from tofuse.engine.results.verdicts import REASONS, ranked, verdict_of
 
 STEP = se3.exp(np.array([0.05, 0, 0, 0, 0.02, 0]))
 
@@ -367,7 +367,7 @@ def test_verdict_is_good_within_tolerance() -> None:
         f"may reach {bound * 1e3:.0f} mm rms (95 % bound); the tolerance is 10 mm." in reason.text
     )
     assert "Most of it is due to noise." in reason.text
-    assert remedy(reason) == "Take more views of the same places: they average the noise."
+    assert reason.remedy == "Take more views of the same places: they average the noise."
     assert "Frame " in reason.text
     assert codes(replace(e, diagonal_m=201 * bound)) == []
     assert codes(replace(e, diagonal_m=199 * bound)) == ["uncertain_poses"]
@@ -382,7 +382,7 @@ def test_rotation_has_its_own_tolerance() -> None:
     (reason,) = judge(replace(e, tolerance_m=10.0))[1]
     assert reason.code == "uncertain_poses"
     assert "the tolerance is 2.0°" in reason.text
-    assert remedy(reason).startswith("Return to places seen before")
+    assert reason.remedy.startswith("Return to places seen before")
     assert codes(evidence(gaps=(), sigma=(1e-5, np.radians(0.1)))) == []
 
 
@@ -424,7 +424,7 @@ def test_reasons_are_merged_and_sorted() -> None:
     assert [r.code for r in reasons] == ["few_poses", "jumped", "loop_gap", "stood_still"]
     assert reasons[1] == Reason("jumped", ((1, 9), (11, 12)), "b. a.")
     assert reasons[1].frames == (1, 12)
-    assert [bool(remedy(r)) for r in reasons] == [True, False, True, False]
+    assert [bool(r.remedy) for r in reasons] == [True, False, True, False]
 
 
 def test_disconnected_parts_are_named() -> None:

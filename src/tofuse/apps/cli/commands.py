@@ -365,8 +365,8 @@ def _verdict_lines(verdict: str, reasons: Sequence[Reason]) -> list[str]:
     for reason in verdicts.ranked(reasons):
         level = verdicts.REASONS[reason.code][0]
         lines.append(f"  [{VERDICT_COLORS[level]}]{level}:[/] {escaped(reason.text)}")
-        if remedy := verdicts.remedy(reason):
-            lines.append(f"    [dim]{escaped(remedy)}[/]")
+        if reason.remedy:
+            lines.append(f"    [dim]{escaped(reason.remedy)}[/]")
     return lines
 
 

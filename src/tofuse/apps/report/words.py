@@ -88,7 +88,7 @@ def findings(reasons: Sequence[Reason], total: int) -> list[dict[str, Any]]:
                 "level": level,
                 "text": _with_frames(reason, total) if reason.text.strip() else meaning,
                 "ranges": reason.ranges,
-                "advice": verdicts.remedy(reason),
+                "advice": reason.remedy,
                 "where": frame_ranges.in_words(reason.ranges).replace("-", "–") * is_subset,
             }
         )

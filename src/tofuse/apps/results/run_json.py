@@ -19,14 +19,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import se3
 from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.refinement import Refinement, calibration_check
-from tofuse.engine.results import (
-    FrameRecord,
-    Mirror,
-    Reason,
-    Reconstruction,
-    SelfCalibration,
-    verdicts,
-)
+from tofuse.engine.results import FrameRecord, Mirror, Reason, Reconstruction, SelfCalibration
 from tofuse.formats.files import atomic, reading
 from tofuse.formats.poses import read_tum
 
@@ -154,10 +147,7 @@ def accuracy_json(a: pose_accuracy.Accuracy) -> dict[str, Any]:
 
 def reasons_json(reasons: Sequence[Reason]) -> list[dict[str, Any]]:
     """Return the reasons as `run.json` has them."""
-    return [
-        {**_fields(reason, "code", "frames", "ranges", "text"), "remedy": verdicts.remedy(reason)}
-        for reason in reasons
-    ]
+    return [_fields(reason, "code", "frames", "ranges", "text", "remedy") for reason in reasons]
 
 
 def _refinement(r: Refinement | None) -> dict[str, Any] | None:

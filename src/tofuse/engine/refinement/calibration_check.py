@@ -271,8 +271,9 @@ class _Estimate:
         Factor of the priors of the errors in reweighted least squares.
     unusual
         Name of the error that is not usual, empty if all are.
-    drift
-        A drift by a distance that is not usual, if one is far likelier, beside that error.
+    drift, drifted
+        A drift by a distance that is not usual, if one is far likelier, beside that error; and the
+        (K,) errors of that alone.
     """
 
     poses: Float64
@@ -282,6 +283,7 @@ class _Estimate:
     prior_weight: float
     unusual: str
     drift: RangeChange | None
+    drifted: Float64
 
     @classmethod
     def of(cls, linearised: Linearised) -> _Estimate:
@@ -293,11 +295,14 @@ class _Estimate:
         usual = {name: np.append(_sigmas(name), usual_drifts) for name in ("", *_INDEX)}
         models = {name: shared.posterior(sigmas) for name, sigmas in usual.items()}
         best = max(models, key=lambda name: models[name].evidence)
-        drift = _likely_drift(shared, usual.values(), models[best].evidence, drifts, linearised)
+        drift, drifted = _likely_drift(
+            shared, usual.values(), models[best].evidence, drifts, linearised
+        )
         if models[best].evidence - models[""].evidence < _STRONG:
             best = ""
         weight = shared.dispersion / linearised.curvature
-        return cls(linearised.poses, models[best], models[""], shared.motion, weight, best, drift)
+        found, if_usual = models[best], models[""]
+        return cls(linearised.poses, found, if_usual, shared.motion, weight, best, drift, drifted)
 
     @property
     def by_name(self) -> dict[str, tuple[float, float]]:
@@ -316,7 +321,7 @@ class _Estimate:
     @property
     def motion(self) -> dict[str, tuple[float, float]]:
         """See `CalibrationCheck.motion`."""
-        return {name: self._motion(np.eye(len(self.follow))[k]) for k, name in enumerate(_INDEX)}
+        return {name: self.motion_by(np.eye(len(self.follow))[k]) for k, name in enumerate(_INDEX)}
 
     @property
     def moved(self) -> Float64:
@@ -331,10 +336,10 @@ class _Estimate:
         """See `CalibrationCheck.spread`."""
         variances, axes = np.linalg.eigh(self.found.covariance)
         columns = axes.T * np.sqrt(np.maximum(variances, 0.0))[:, None]
-        m, rad = np.linalg.norm([self._motion(column) for column in columns], axis=0).tolist()
+        m, rad = np.linalg.norm([self.motion_by(column) for column in columns], axis=0).tolist()
         return m, rad
 
-    def _motion(self, errors: Float64) -> tuple[float, float]:
+    def motion_by(self, errors: Float64) -> tuple[float, float]:
         """Rms motion (m, rad) of the poses by errors (K,), to first order."""
         size = max(float(np.linalg.norm(errors)), 1e-12)
         m, rad = rms_motion(self.poses, self._moved(_DELTA / size * errors))
@@ -347,11 +352,11 @@ def _likely_drift(
     evidence: float,
     drifts: Float64,
     linearised: Linearised,
-) -> RangeChange | None:
-    """Return the likeliest of drifts (D, N) that is not usual; None without strong evidence.
+) -> tuple[RangeChange | None, Float64]:
+    """Return the likeliest of drifts (D, N) that is not usual, and the errors (K,) of it alone.
 
-    And if it is by a factor. `usual` are the standard deviations (K,) of models without one, and
-    `evidence` of the likeliest.
+    None, and zeros, without strong evidence, and if it is by a factor. `usual` are the standard
+    deviations (K,) of models without one, and `evidence` of the likeliest.
     """
     best: tuple[Posterior, int] | None = None
     for sigmas in usual:
@@ -361,15 +366,16 @@ def _likely_drift(
             if found.evidence > (evidence + _STRONG if best is None else best[0].evidence):
                 best = found, k
     if best is None or best[1] >= len(_INDEX) + len(drifts):
-        return None
+        return None, np.zeros(len(shared.gradient))
     found, k = best
     views = linearised.state.views
     first = views[int(drifts[k - len(_INDEX)].argmax())]
     # What poses have not taken up of a large drift is no noise: the weights stay as they are.
     step = linearised.curvature
     chance = significance_of(shared.independent[k]) * shared.serial_sigma[k]
-    return RangeChange(
-        -step * float(found.errors[k]),
+    drifted = np.where(np.arange(len(found.errors)) == k, step * found.errors, 0.0)
+    change = RangeChange(
+        -float(drifted[k]),
         step * float(np.sqrt(found.covariance[k, k])),
         frame=None,
         limit=_CERTAIN,
@@ -377,6 +383,7 @@ def _likely_drift(
         recording=recording_of(first, views),
         in_metres=True,
     )
+    return change, drifted
 
 
 def _by_first_estimate(
@@ -391,8 +398,11 @@ def _by_first_estimate(
         moved=rms_motion(first.poses, first.moved),
         spread=first.spread,
     )
-    if first.drift is not None and first.drift.is_large:
-        return replace(check, range_change=first.drift)
+    if first.drift is not None:
+        if first.drift.is_large:
+            return replace(check, range_change=first.drift)
+        confirmed = first.drift.confirmed
+        check = replace(check, changed=first.motion_by(first.drifted), change_confirmed=confirmed)
     change = likely_change(linearised)
     if change is None:
         return check

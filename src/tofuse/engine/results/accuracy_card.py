@@ -11,7 +11,7 @@ from tofuse.engine.quality import pose_accuracy
 from tofuse.engine.quantities import count, length
 from tofuse.engine.results.checks import TOLERANCE_RAD
 from tofuse.engine.results.types import Diagnostics, Reconstruction
-from tofuse.engine.results.verdicts import ranked, remedy
+from tofuse.engine.results.verdicts import ranked
 
 SEPARATOR = " · "
 
@@ -37,7 +37,7 @@ def advice(d: Diagnostics) -> tuple[str, Sequence[frame_ranges.Range]]:
 
     It is for the most severe reason, or for one that may cause all others.
     """
-    by_code = {r.code: r for r in ranked(d.reasons) if remedy(r)}
+    by_code = {r.code: r for r in ranked(d.reasons) if r.remedy}
     if d.verdict == "good":
         return "", ()
     if any(r.code == "faulty_recording" for r in d.reasons):
@@ -46,7 +46,7 @@ def advice(d: Diagnostics) -> tuple[str, Sequence[frame_ranges.Range]]:
     if reason is None:
         return "", ()
     concerns_all = frame_ranges.size(reason.ranges) >= len(d.frames)
-    return remedy(reason), () if concerns_all else reason.ranges
+    return reason.remedy, () if concerns_all else reason.ranges
 
 
 def bound(accuracy: pose_accuracy.Accuracy, diagonal_m: float) -> str:

@@ -35,7 +35,7 @@ class Reason:
     text
         What was found, in one or a few sentences.
     remedy
-        What to do about it, if that depends on what was found; else see `verdicts.remedy`.
+        What to do about it, in one or a few sentences; empty if nothing is known.
     """
 
     code: str

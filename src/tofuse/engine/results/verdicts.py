@@ -117,15 +117,11 @@ def verdict_of(reasons: Iterable[Reason]) -> Verdict:
     return "degraded" if "degraded" in forced else "good"
 
 
-def remedy(reason: Reason) -> str:
-    """Return what to do about a reason, in one or a few sentences; empty if nothing is known."""
-    return reason.remedy or _REMEDIES.get(reason.code, "")
-
-
 def ranked(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
     """Return the reasons, each code once: the most severe first, then those of most frames.
 
-    Reasons with the same code are merged: the union of their ranges, and all their texts.
+    Reasons with the same code are merged: the union of their ranges, and all their texts. Those
+    without a remedy get that of their code, if there is any.
     """
     by_code: dict[str, list[Reason]] = {}
     for reason in reasons:
@@ -137,10 +133,10 @@ def ranked(reasons: Sequence[Reason]) -> tuple[Reason, ...]:
 
 
 def _merged(group: Sequence[Reason]) -> Reason:
-    if len(group) == 1:
-        return group[0]
-    texts, remedies = (
-        dict.fromkeys(each) for each in zip(*((r.text, r.remedy) for r in group), strict=True)
-    )
+    code = group[0].code
     ranges = frame_ranges.union(r for reason in group for r in reason.ranges)
-    return Reason(group[0].code, ranges, " ".join(texts), " ".join(filter(None, remedies)))
+    texts, remedies = (
+        " ".join(filter(None, dict.fromkeys(each)))
+        for each in zip(*((r.text, r.remedy) for r in group), strict=True)
+    )
+    return Reason(code, ranges, texts, remedies or _REMEDIES.get(code, ""))
