@@ -427,6 +427,12 @@ def test_reasons_are_merged_and_sorted() -> None:
     assert [bool(r.remedy) for r in reasons] == [True, False, True, False]
 
 
+def test_short_main_model_fails_unless_it_is_that_of_the_first_session() -> None:
+    short = in_components(apart((3, 8)))
+    assert codes(short) == ["few_poses", "disconnected"]
+    assert codes(replace(short, main_is_first=True)) == ["disconnected"]
+
+
 def test_disconnected_parts_are_named() -> None:
     (reason,) = judge(CASES["disconnected"])[1]
     assert reason.ranges == ((7, 8),)

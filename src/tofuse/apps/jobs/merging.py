@@ -35,7 +35,7 @@ from tofuse.engine.parts import check_number
 from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.quality import trajectory_errors
 from tofuse.engine.quantities import percent, probability
-from tofuse.engine.results import Reason, Reconstruction, SessionRecord, in_main_model, verdicts
+from tofuse.engine.results import Reason, Reconstruction, SessionRecord, verdicts
 from tofuse.engine.stored_views import PosedView
 from tofuse.engine.tracking import given
 from tofuse.engine.views import PreparedView
@@ -253,8 +253,6 @@ def _reasons(result: Reconstruction) -> Iterator[Reason]:
     """Return the reasons, with the names of sessions that are not joined."""
     unjoined = [s.name for s in result.sessions if s.T_main_session is None]
     for reason in result.diagnostics.reasons:
-        if unjoined and reason.code == "few_poses" and _covers_most(result):
-            continue
         if unjoined and reason.code == "disconnected":
             main = [s.name for s in result.sessions if s.T_main_session is not None]
             text = f"No overlap could be confirmed between {' or '.join(main)} and "
@@ -269,17 +267,6 @@ def _reasons(result: Reconstruction) -> Iterator[Reason]:
             yield replace(reason, text=f"{text}. {reason.text}")
         else:
             yield reason
-
-
-def _covers_most(result: Reconstruction) -> bool:
-    """Whether the main model contains most frames of the sessions joined to it."""
-    joined = [s for s in result.sessions if s.T_main_session is not None]
-    frames = [
-        f
-        for f in result.diagnostics.frames
-        if f.status != "skipped" and any(s.has(f.index) for s in joined)
-    ]
-    return 2 * sum(in_main_model(f, result.components) for f in frames) >= len(frames)
 
 
 def merge_files(

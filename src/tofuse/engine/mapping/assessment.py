@@ -179,6 +179,7 @@ class Assessment:
             doubtful=motion.doubtful,
             single_link_frames=single_link_frames(self.tracked, loops),
             ambiguous=ambiguous,
+            main_is_first=self.config.joining.main == "first",
         )
         verdict, reasons = checks.judge(evidence)
         if verdict == "failed":  # its evidence is contradicted, or says little about the rest

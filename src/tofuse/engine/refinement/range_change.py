@@ -5,7 +5,8 @@ follow it. A scale that all views share is invisible in them, but views of the s
 and after a change disagree. Refined views give the change by a step at each view, and by a constant
 drift, with all poses free: one Newton step for each. A likely change is estimated in full: the
 views are scaled by it and aligned again. Joined recordings have no order in time: each may drift or
-change on its own, and as a whole differ from the first one.
+change on its own, and as a whole differ from the first one. A drift by a distance resembles errors
+of the calibration and is estimated with these (`calibration_check`).
 """
 
 from __future__ import annotations

@@ -131,6 +131,8 @@ class Evidence:
         Indices of the frames that a single registration connects to the first one.
     ambiguous
         Indices of examined frames that another step, or another place, fits as well.
+    main_is_first
+        Whether the first session is in the main model, even if another one is longer.
     """
 
     records: tuple[FrameRecord, ...]
@@ -160,6 +162,7 @@ class Evidence:
     doubtful: tuple[int, ...] = ()
     single_link_frames: tuple[int, ...] = ()
     ambiguous: tuple[int, ...] = ()
+    main_is_first: bool = False
 
     @property
     def full_range(self) -> tuple[frame_ranges.Range, ...]:
@@ -218,6 +221,9 @@ def judge(evidence: Evidence) -> tuple[Verdict, tuple[Reason, ...]]:
 
 def _poses(e: Evidence) -> Iterator[Reason]:
     readable = [r for r in e.records if r.status != "skipped"]
+    if e.main_is_first:  # however long other, disconnected parts are
+        away = {k for k, component in enumerate(e.components) if not component.connected}
+        readable = [r for r in readable if r.component not in away]
     posed = [r for r in readable if r.status != "lost"]
     main = sum(e.in_main)
     # A single frame is no model if there are other, unconnected ones.
