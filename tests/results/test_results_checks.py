@@ -367,7 +367,7 @@ def test_verdict_is_good_within_tolerance() -> None:
         f"may reach {bound * 1e3:.0f} mm rms (95 % bound); the tolerance is 10 mm." in reason.text
     )
     assert "Most of it is due to noise." in reason.text
-    assert reason.remedy == "Take more views of the same places: they average the noise."
+    assert reason.remedy == "Record more views of the same places, to average out the noise."
     assert "Frame " in reason.text
     assert codes(replace(e, diagonal_m=201 * bound)) == []
     assert codes(replace(e, diagonal_m=199 * bound)) == ["uncertain_poses"]

@@ -271,9 +271,9 @@ class _Estimate:
         Factor of the priors of the errors in reweighted least squares.
     unusual
         Name of the error that is not usual, empty if all are.
-    drift, drifted
-        A drift by a distance that is not usual, if one is far likelier, beside that error; and the
-        (K,) errors of that alone.
+    drift
+        A drift by a distance that is not usual, and its position among the errors, if one is far
+        likelier, beside that error.
     """
 
     poses: Float64
@@ -282,8 +282,7 @@ class _Estimate:
     follow: Float64
     prior_weight: float
     unusual: str
-    drift: RangeChange | None
-    drifted: Float64
+    drift: tuple[int, RangeChange] | None
 
     @classmethod
     def of(cls, linearised: Linearised) -> _Estimate:
@@ -295,14 +294,11 @@ class _Estimate:
         usual = {name: np.append(_sigmas(name), usual_drifts) for name in ("", *_INDEX)}
         models = {name: shared.posterior(sigmas) for name, sigmas in usual.items()}
         best = max(models, key=lambda name: models[name].evidence)
-        drift, drifted = _likely_drift(
-            shared, usual.values(), models[best].evidence, drifts, linearised
-        )
+        drift = _likely_drift(shared, usual.values(), models[best].evidence, drifts, linearised)
         if models[best].evidence - models[""].evidence < _STRONG:
             best = ""
         weight = shared.dispersion / linearised.curvature
-        found, if_usual = models[best], models[""]
-        return cls(linearised.poses, found, if_usual, shared.motion, weight, best, drift, drifted)
+        return cls(linearised.poses, models[best], models[""], shared.motion, weight, best, drift)
 
     @property
     def by_name(self) -> dict[str, tuple[float, float]]:
@@ -352,11 +348,11 @@ def _likely_drift(
     evidence: float,
     drifts: Float64,
     linearised: Linearised,
-) -> tuple[RangeChange | None, Float64]:
-    """Return the likeliest of drifts (D, N) that is not usual, and the errors (K,) of it alone.
+) -> tuple[int, RangeChange] | None:
+    """Return the likeliest of drifts (D, N) that is not usual, and its position among the errors.
 
-    None, and zeros, without strong evidence, and if it is by a factor. `usual` are the standard
-    deviations (K,) of models without one, and `evidence` of the likeliest.
+    None without strong evidence, and if it is by a factor. `usual` are the standard deviations
+    (K,) of models without one, and `evidence` is that of the likeliest of these.
     """
     best: tuple[Posterior, int] | None = None
     for sigmas in usual:
@@ -366,16 +362,15 @@ def _likely_drift(
             if found.evidence > (evidence + _STRONG if best is None else best[0].evidence):
                 best = found, k
     if best is None or best[1] >= len(_INDEX) + len(drifts):
-        return None, np.zeros(len(shared.gradient))
+        return None
     found, k = best
     views = linearised.state.views
     first = views[int(drifts[k - len(_INDEX)].argmax())]
     # What poses have not taken up of a large drift is no noise: the weights stay as they are.
     step = linearised.curvature
     chance = significance_of(shared.independent[k]) * shared.serial_sigma[k]
-    drifted = np.where(np.arange(len(found.errors)) == k, step * found.errors, 0.0)
     change = RangeChange(
-        -float(drifted[k]),
+        -step * float(found.errors[k]),
         step * float(np.sqrt(found.covariance[k, k])),
         frame=None,
         limit=_CERTAIN,
@@ -383,7 +378,7 @@ def _likely_drift(
         recording=recording_of(first, views),
         in_metres=True,
     )
-    return change, drifted
+    return k, change
 
 
 def _by_first_estimate(
@@ -399,10 +394,11 @@ def _by_first_estimate(
         spread=first.spread,
     )
     if first.drift is not None:
-        if first.drift.is_large:
-            return replace(check, range_change=first.drift)
-        confirmed = first.drift.confirmed
-        check = replace(check, changed=first.motion_by(first.drifted), change_confirmed=confirmed)
+        k, drift = first.drift
+        if drift.is_large:
+            return replace(check, range_change=drift)
+        moved_by = first.motion_by(-drift.change * np.eye(len(first.follow))[k])
+        check = replace(check, changed=moved_by, change_confirmed=drift.confirmed)
     change = likely_change(linearised)
     if change is None:
         return check

@@ -57,17 +57,17 @@ _CAUSES = {
     "refinement": "the correction by the refinement",
     "disagreement": "surfaces that differ between views, by multipath or changes of the scene",
     "calibration": "the camera's calibration",
-    "range": "ranges that are wrong by different amounts in different places, as by multipath",
+    "range": "range errors that differ from place to place, such as those by multipath",
 }
 # What would lower the bound, by what most of it is due to; "" for the orientations.
 _REMEDIES = {
     "": "Return to places seen before, and keep corners and texture in view.",
-    "noise": "Take more views of the same places: they average the noise.",
+    "noise": "Record more views of the same places, to average out the noise.",
     "refinement": "Return to the start: a loop would confirm it.",
-    "disagreement": "Record while nothing moves, and see corners from several sides.",
+    "disagreement": "Record while nothing moves, and view corners from several directions.",
     "calibration": "Calibrate the camera (tofuse calibrate depth), or turn it more and return to "
     "the start.",
-    "range": "See the same places from several distances and sides.",
+    "range": "View the same places from several distances and directions.",
 }
 
 

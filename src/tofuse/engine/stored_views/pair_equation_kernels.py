@@ -407,9 +407,9 @@ def _respond_to_errors(
         steep_q = bend_q * across_q / max(qz * qz, tiny) + longer_q * kept_q
         center_p = pz / projection_kernels.distortion(rho2_p, lens)
         center_q = qz / projection_kernels.distortion(rho2_q, lens)
-        nearer_p, nearer_q = along_p / np.sqrt(p2), range_q * along_q / np.sqrt(q2)
-        block[(_RESPONSE + OFFSET) * residual.LANES + k] = nearer_p - nearer_q
-        block[(_RESPONSE + SOURCE_OFFSET) * residual.LANES + k] = nearer_p
+        per_metre_p, per_metre_q = along_p / np.sqrt(p2), range_q * along_q / np.sqrt(q2)
+        block[(_RESPONSE + OFFSET) * residual.LANES + k] = per_metre_p - per_metre_q
+        block[(_RESPONSE + SOURCE_OFFSET) * residual.LANES + k] = per_metre_p
         block[(_RESPONSE + SCALE) * residual.LANES + k] = along_p - range_q * along_q
         block[(_RESPONSE + SOURCE_SCALE) * residual.LANES + k] = along_p
         block[(_RESPONSE + FOCAL) * residual.LANES + k] = longer_p * scaled_p - longer_q * scaled_q
