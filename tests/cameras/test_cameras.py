@@ -21,6 +21,7 @@ from tofuse.engine.cameras.cameras import (
 from tofuse.engine.cameras.depth_conversion import points_from_z, range_from_z, z_from_range
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry.rays import homogeneous, unit_rays
+from tofuse.engine.views.projection import Projection
 
 PINHOLE = Pinhole(176, 144, 230.0, 231.0, 87.0, 71.5)
 BROWN = BrownConrady(176, 144, 230.0, 231.0, 87.0, 71.5, -0.3, 0.1, 0.001, -0.002, 0.01)
@@ -151,6 +152,21 @@ def test_ray_table_keeps_rays_and_tolerates_holes() -> None:
     uv = camera.project([[rays[50, 60, 0] * 3, rays[50, 60, 1] * 3, 3.0]])
     np.testing.assert_allclose(uv, [[60, 50]], atol=1e-3)
     assert abs(camera.fit.fx - BROWN.fx) < 10
+
+
+@pytest.mark.parametrize("half_field", [0.9, 1.05])
+def test_ray_tables_of_round_images_project_to_their_pixels(half_field: float) -> None:
+    v, u = np.mgrid[0:192, 0:192] - 95.5  # equidistant: the pinhole fit is far off at the rim
+    angle = np.hypot(u, v) / 86
+    rays = np.stack([u, v], -1) * (np.tan(angle) / (86 * angle))[..., None]
+    rays[angle > half_field] = np.nan
+    known = np.isfinite(rays).all(-1)
+    assert known.mean() < 0.8
+    uv = RayTable(rays.astype(np.float32)).project(homogeneous(rays)[known])
+    np.testing.assert_allclose(uv, np.argwhere(known)[:, ::-1], atol=0.01)
+    view = Projection.of(RayTable(rays.astype(np.float32)), 1)
+    uv = view.pixels(view.rays[np.isfinite(view.rays).all(-1)].astype(float))
+    np.testing.assert_allclose(uv, np.argwhere(known)[:, ::-1], atol=0.1)
 
 
 def test_scaling_keeps_rays_of_block_centres() -> None:

@@ -17,7 +17,7 @@ from made_recordings import make_sr4000
 from refused import refused
 from tofuse.engine.cameras.cameras import Pinhole, RayTable
 from tofuse.engine.errors import InputError, OutputError
-from tofuse.engine.frames.frames import CloudFrame, RangeFrame
+from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
 from tofuse.engine.frames.recording import POSES_BY, ArraySource, Recording
 from tofuse.engine.noise import NOISE
 from tofuse.engine.noise.model import family_of
@@ -103,6 +103,19 @@ def test_amplitude_is_of_the_kind_of_frames_that_have_it(tmp_path: Path) -> None
     ]
     convert(Recording.of(ArraySource(frames), "made", "made"), tmp_path / "out")
     assert open_recording(tmp_path / "out")[1].amplitude_kind == "range_compensated"
+
+
+@pytest.mark.parametrize(("largest", "factor"), [(1.0, 1e4), (400.0, 1.0)])
+def test_fractions_of_amplitude_are_kept(tmp_path: Path, largest: float, factor: float) -> None:
+    """Intensities of 0 to 1 are not rounded to 0 and 1; larger ones keep their counts."""
+    rng, camera = np.random.default_rng(3), Pinhole(8, 6, 10.0, 10.0, 3.5, 2.5)
+    amplitude = rng.uniform(0.02, 1, (6, 8)).astype(np.float32) * np.float32(largest)
+    amplitude[0, 0], amplitude[0, 1] = 0, SATURATED_AMPLITUDE
+    frame = RangeFrame(0, 0.0, camera, np.ones((6, 8), np.float32), amplitude_image=amplitude)
+    convert(Recording.of(ArraySource([frame]), "made", "made"), tmp_path / "out")
+    found = open_recording(tmp_path / "out")[0].amplitude_image
+    assert (found[0, 0], found[0, 1]) == (0, SATURATED_AMPLITUDE)
+    np.testing.assert_allclose(found.ravel()[2:], factor * amplitude.ravel()[2:], atol=0.51)
 
 
 def test_rays_of_each_frame(tmp_path: Path) -> None:

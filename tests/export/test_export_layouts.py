@@ -126,6 +126,15 @@ def test_first_image_may_be_dark(tmp_path: Path, dark: np.ndarray | None) -> Non
     assert any("black" in w for w in done.warnings)
 
 
+def test_colour_of_another_view_is_not_passed_off_as_that_of_depth(tmp_path: Path) -> None:
+    color = np.full((72, 96, 3), 90, np.uint8)
+    for registered in (True, False):
+        frame = replace(turned()[0], color_image=color, color_registered=registered)
+        recording = Recording.of(ArraySource([frame]), "made", "made")
+        done = convert_to(recording, tmp_path / str(registered), "open3d")
+        assert any("not registered" in line for line in done.warnings) != registered
+
+
 def test_unsupported_conversions_are_refused(tmp_path: Path) -> None:
     cloud = Recording.of(ArraySource([CloudFrame.of(np.ones((5, 3)))]), "made", "made")
     refused("contains clouds", cloud, tmp_path / "a", "tum", by=convert_to)

@@ -6,6 +6,7 @@ import base64
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,9 @@ from cli_calls import printed, refuses
 from posed_results import DISTANCE, NORMAL, POSED, POSES, made_result, plane
 from tofuse.apps.export import exporting
 from tofuse.apps.export.exporting import export
+from tofuse.apps.export.mcap_file import write_mcap
 from tofuse.apps.export.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from tofuse.apps.export.scene import Scene
 from tofuse.apps.results.folders import OutputFolder
 from tofuse.engine.cameras.cameras import Pinhole
 from tofuse.engine.errors import InputError
@@ -191,6 +194,21 @@ def test_mcap_read_by_its_reader(result: Path) -> None:
     np.testing.assert_array_equal(K, [[40, 0, 23], [0, 41, 18], [0, 0, 1]])
     jpeg = np.frombuffer(base64.b64decode(messages["/color/image"][1][1]["data"]), np.uint8)
     assert cv2.imdecode(jpeg, cv2.IMREAD_COLOR).shape == (36, 48, 3)
+
+
+def test_mcap_of_times_that_are_negative_and_out_of_order(result: Path) -> None:
+    reader = pytest.importorskip("mcap.reader", reason="pip install mcap")
+    scene = Scene.read(result, 4)
+    path = result / "scene.mcap"
+    write_mcap(replace(scene, times=-0.5 - 0.1 * np.arange(len(scene.times))), path)
+    with path.open("rb") as file:
+        found = [
+            (channel.topic, message.log_time)
+            for _, channel, message in reader.make_reader(file).iter_messages()
+        ]
+    times = sorted(time for topic, time in found if topic == "/pose")
+    assert times == [k * 100_000_000 for k in range(len(scene.times))]
+    assert dict(found)["/cloud"] == 0
 
 
 def matrix(position: dict[str, float], orientation: dict[str, float]) -> np.ndarray:

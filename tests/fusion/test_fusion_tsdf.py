@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ball_views import CAMERA, EYE, around_a_ball, frame_of, look, plane_range, sphere_range
-from tofuse.engine.cameras.cameras import Pinhole
+from tofuse.engine.cameras.cameras import BrownConrady, Pinhole
 from tofuse.engine.compute.spill import Spill
 from tofuse.engine.frames.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
 from tofuse.engine.fusion.block_kernels import block_of, voxel_of
@@ -22,6 +22,7 @@ from tofuse.engine.fusion.tsdf import Volume, fuse_surface
 from tofuse.engine.geometry import se3
 from tofuse.engine.refinement.fixed_pattern import FixedPattern
 from tofuse.engine.refinement.refinement import without_errors
+from tofuse.engine.sensor.camera_errors import CameraErrors
 from tofuse.engine.views.prepared_view import prepare_view
 from tofuse.engine.views.view_planes import SurfaceOptions
 from whole_volume import volume_around
@@ -364,6 +365,7 @@ def test_builder_keeps_views_within_memory_limit() -> None:
 
 def test_camera_errors_are_corrected_in_images_as_in_points() -> None:
     frame = frame_of(np.random.default_rng(5).uniform(1, 3, (72, 88)))
+    frame = replace(frame, camera=Pinhole(88, 72, 90.0, 90.0, 43.0, 36.0))  # points have no lens
     errors = {"offset": 0.03, "scale": -0.01, "focal": 0.02}
     correction = CameraCorrection(errors)
     view = RangeView.of(replace(frame, depth_kind="z"))
@@ -390,6 +392,18 @@ def test_camera_errors_are_corrected_in_images_as_in_points() -> None:
     builder.add(frame_of(plane_range(EYE, np.array([0, 0, 1.0]), 2.0)), None, 1000)
     z = builder.fuse({0: EYE}, errors={"scale": 0.05}).mesh.vertices[:, 2]
     np.testing.assert_allclose(z, 2.1, atol=0.003)
+
+
+def test_an_error_of_the_focal_length_moves_rays_by_the_slope_of_the_distortion() -> None:
+    camera = BrownConrady(88, 72, 60.0, 60.0, 43.5, 35.5, k1=-0.15, k2=0.02)
+    view = RangeView.of(RangeFrame(0, 0.0, camera, np.full((72, 88), 2, np.float32)))
+    corrected = CameraCorrection({"focal": 0.02})(view).projection
+    expected = CameraErrors(focal=0.02).camera(camera)
+    rays = expected.rays()[6:-6, 6:-6]  # of a lens that is known beyond them
+    np.testing.assert_allclose(corrected.rays[6:-6, 6:-6], rays, atol=1e-4)
+    landed = corrected.pixels(rays.reshape(-1, 2).astype(float))
+    np.testing.assert_allclose(landed[0], [6, 6], atol=0.05)
+    np.testing.assert_allclose(landed[-1], [81, 65], atol=0.05)
 
 
 def test_depth_errors_that_are_fixed_to_the_camera_are_removed_from_the_surface() -> None:

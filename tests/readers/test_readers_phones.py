@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
 import zipfile
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from tofuse.engine.fusion.geometry_record import GeometryRecord
 from tofuse.engine.quality.map_agreement import map_consistency
 from tofuse.formats.geometry.ply import write_ply
 from tofuse.formats.images.images import write_png
+from tofuse.formats.images.video import Video
 from tofuse.formats.recordings.open import open_recording
 
 
@@ -95,6 +97,28 @@ def test_stray_with_video_and_lens_of_each_frame(tmp_path: Path) -> None:
     data = Path(path).read_bytes()
     Path(path).write_bytes(data[: len(data) // 2])
     assert any("colour is ignored" in line for line in open_recording(tmp_path / "scan").warnings)
+
+
+@pytest.mark.parametrize("turn", [(-1, 0, 0, -1, 320, 240), (0, 1, -1, 0, 240, 0)])
+def test_video_is_not_turned_as_it_states(tmp_path: Path, turn: tuple[int, ...]) -> None:
+    """By 180 degrees colour would have the size of depth, and another view."""
+    path = tmp_path / "rgb.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 60, (320, 240))
+    if not writer.isOpened():
+        pytest.skip("OpenCV writes no video here")
+    image = np.zeros((240, 320, 3), np.uint8)
+    image[:120] = 200
+    writer.write(image)
+    writer.release()
+    data = bytearray(path.read_bytes())
+    a, b, c, d, x, y = turn
+    matrix = struct.pack(">9i", a << 16, b << 16, 0, c << 16, d << 16, 0, x << 16, y << 16, 1 << 30)
+    start = data.index(b"tkhd") + 44  # of the matrix, in version 0 of the header of a track
+    data[start : start + 36] = matrix
+    path.write_bytes(data)
+    read = Video(path).read(0)
+    assert read.shape == image.shape
+    np.testing.assert_allclose(read[::239, ::319], image[::239, ::319], atol=12)
 
 
 def test_arkitscenes_with_bounding_boxes(tmp_path: Path) -> None:

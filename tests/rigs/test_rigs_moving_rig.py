@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,13 @@ from rig_scene import CAMERA, looked_at
 from tofuse.apps.rigs.calibrating import calibrate_cameras
 from tofuse.apps.rigs.hand_eye import HandEye, Track, hand_eye
 from tofuse.apps.rigs.inputs import Calibration, Camera
-from tofuse.apps.rigs.moving_rig import _common_world, _initial_offset, _JointViews, _too_uncertain
+from tofuse.apps.rigs.moving_rig import (
+    _common_world,
+    _initial_offset,
+    _JointViews,
+    _too_uncertain,
+    _views,
+)
 from tofuse.apps.rigs.rig_trajectory import refined
 from tofuse.apps.rigs.run import reconstruct_rig
 from tofuse.engine.cameras.cameras import Pinhole
@@ -157,6 +164,20 @@ def walked(clock: float = 0.0, T: np.ndarray | None = None, seconds: float = 6.0
     times = np.arange(round(30 * seconds)) / 30.0
     poses = np.stack([path(t) @ (np.eye(4) if T is None else T) for t in times])
     return Track(times - clock, se3.inverse(poses[0]) @ poses)
+
+
+def test_frames_out_of_order_have_the_track_and_views_of_their_times() -> None:
+    ordered, order = walked(), np.random.default_rng(4).permutation(180)
+    track = Track.of(ordered.times[order], ordered.poses[order])
+    np.testing.assert_array_equal(track.times, ordered.times)
+    np.testing.assert_array_equal(track.poses, ordered.poses)
+    camera = SimpleNamespace(
+        recording=SimpleNamespace(timestamps=ordered.times[order]),
+        image=lambda k: order[k],  # its place in order
+        surface=lambda place: place,
+    )
+    for row, place in _views(camera, track, 7):
+        assert row == place
 
 
 def clock_between(first: Track, second: Track) -> tuple[float, list[str]]:

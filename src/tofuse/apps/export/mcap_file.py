@@ -50,7 +50,7 @@ def write_mcap(scene: Scene, path: Path) -> None:
     with atomic.replacing(path) as temporary, temporary.open("wb") as file:
         writer = mcap.Writer(file)
         writer.start(library=f"tofuse {__version__}")
-        messages = _Messages(writer, min(0.0, float(scene.times[0])))
+        messages = _Messages(writer, min(0.0, float(scene.times.min())))
         _write_model(messages, scene)
         for time, T in zip(scene.times, scene.poses, strict=True):
             messages.transform(float(time), WORLD, CAMERA, T)
@@ -96,7 +96,7 @@ class _Messages:
 
 
 def _write_model(messages: _Messages, scene: Scene) -> None:
-    start = float(scene.times[0])
+    start = float(scene.times.min())
     messages.transform(start, MAP, WORLD, scene.T_zup_world)
     messages.write("/trajectory", start, frame_id=WORLD, poses=[_pose(T) for T in scene.poses])
     points = _points(scene.cloud)

@@ -46,8 +46,9 @@ class Track:
 
     @classmethod
     def of(cls, times: Float64, poses: Float64) -> Track:
-        """Return the track of the frames with a pose."""
-        posed = np.isfinite(poses[:, 0, 0])
+        """Return the track of the frames with a pose, whose times may be in any order."""
+        posed = np.flatnonzero(np.isfinite(poses[:, 0, 0]))
+        posed = posed[np.argsort(times[posed], kind="stable")]
         return cls(times[posed], poses[posed])
 
     @property

@@ -32,6 +32,7 @@ from tofuse.engine.progress import Progress, Silent
 from tofuse.engine.refinement import joint_alignment, propagate_poses, refined_by_halves
 from tofuse.engine.search import are_distinct_poses, register_pair
 from tofuse.engine.stored_views import SampledView, pair_equations
+from tofuse.engine.times import nearest
 from tofuse.engine.views import PreparedView
 from tofuse.formats.rigs import Rig, RigCamera
 
@@ -180,8 +181,10 @@ def _common_world(
 
 def _views(camera: Camera, track: Track, count: int) -> Iterator[tuple[int, PreparedView]]:
     """Yield some views along a track, with the rows of their poses."""
-    for p in evenly_spaced(np.arange(len(track.times)), count):
-        frame = camera.image(int(np.searchsorted(camera.recording.timestamps, track.times[p])))
+    rows = evenly_spaced(np.arange(len(track.times)), count)
+    frames = nearest(camera.recording.timestamps, track.times[rows])
+    for p, k in zip(rows, frames, strict=True):
+        frame = camera.image(int(k))
         if frame is not None:
             yield p, camera.surface(frame)
 

@@ -130,7 +130,8 @@ def _rig_estimates(
     for stated, camera in zip(source.rig.cameras, cameras, strict=True):
         progress.stage(f"tracking {camera.name}")
         result = reconstructing.reconstruct(camera.recording, progress=Silent())
-        track = Track.of(result.timestamps + stated.time_offset_s, result.trajectory)
+        own_times = result.timestamps + stated.time_offset_s
+        track = Track.of(own_times, result.trajectory)
         if len(track.times) < 2:
             progress.note(f"{camera.name} has no trajectory")
             continue
@@ -144,7 +145,7 @@ def _rig_estimates(
         by_pose = np.linalg.inv(A @ np.stack(covariances) @ A.T)
         T, valid = track.at(times)
         poses.append(np.where(valid[:, None, None], T @ se3.inverse(stated.T_rig_camera), np.nan))
-        information.append(by_pose[nearest(track.times, times)])
+        information.append(by_pose[nearest(own_times[result.has_pose], times)])
     if not poses:
         raise InputError("no camera has a trajectory", where="the rig")
     return np.stack(poses), np.stack(information)

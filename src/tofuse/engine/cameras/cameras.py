@@ -14,6 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 from weakref import WeakKeyDictionary
 
 import numpy as np
+import scipy  # loads its parts when they are used
 from numpy.typing import ArrayLike, NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64
@@ -315,16 +316,33 @@ class RayTable:
 
     @cached_property
     def _filled(self) -> Float64:
-        """Return the table in float64, with holes filled by the pinhole fit."""
-        return np.where(np.isfinite(self.table), self.table, self.fit.rays()).astype(float)
+        """The table in float64; unknown rays go on as the nearest ones with known neighbours do.
+
+        A step in the table would be a second place for the rays at the rim of what is known.
+        """
+        rays = self.table.astype(float)
+        unknown = ~np.isfinite(rays).all(-1)
+        if not unknown.any():
+            return rays
+        by_row, by_column = np.gradient(rays, axis=(0, 1))
+        smooth = np.isfinite(by_row + by_column).all(-1)
+        if not smooth.any():
+            return np.where(unknown[..., None], self.fit.rays(), rays)
+        nearest = scipy.ndimage.distance_transform_edt(
+            ~smooth, return_distances=False, return_indices=True
+        )
+        i, j = nearest[:, unknown]
+        down, right = (np.argwhere(unknown) - np.stack([i, j], 1)).T[:, :, None]
+        rays[unknown] = rays[i, j] + down * by_row[i, j] + right * by_column[i, j]
+        return rays
 
     def project(self, points: ArrayLike) -> Float64:
         """Project points by Newton's method on the interpolated table; see `Camera.project`."""
         points = np.asarray(points, float)
         z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
         target = points[..., :2] / z[..., None]
-        uv = self.fit.project(points)
         limits = np.array([self.width - 1.0, self.height - 1.0])
+        uv = np.clip(self.fit.project(points), 0, limits)  # beyond it, the fit can be far off
         with np.errstate(all="ignore"):  # diverges for points that the camera does not see
             for _ in range(8):
                 base = np.clip(np.nan_to_num(np.floor(uv)), 0, limits - 1).astype(np.intp)

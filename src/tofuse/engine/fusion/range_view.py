@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tofuse.engine.arrays import Bool, Float32, Float64, Int8, UInt8, UInt16
-from tofuse.engine.cameras import ray_lengths
+from tofuse.engine.cameras import RayTable, lens, ray_lengths
 from tofuse.engine.compute import Spill, median
 from tofuse.engine.frames import SATURATED_AMPLITUDE, CloudFrame, RangeFrame
 from tofuse.engine.fusion.tsdf_kernels import StoredView, mark_jumps, pack_view, shrink_to_planes
@@ -264,14 +264,12 @@ class CameraCorrection:
         return replace(view, z=counts, unit=unit, projection=corrected)
 
     def _corrected(self, projection: Projection) -> Projection:
-        focal_factor = 1 + self._errors.get("focal", 0.0)
-        if focal_factor == 1:
+        focal = self._errors.get("focal", 0.0)
+        if not focal:
             return projection
         if id(projection) not in self._projections:
-            frame = projection.frame * np.repeat([focal_factor, 1 / focal_factor], 2)
-            rays = np.asarray(projection.rays * np.float32(focal_factor))
-            wider = Projection(rays, projection.lookup, frame)
-            self._projections[id(projection)] = projection, wider
+            camera = RayTable(lens.moved_rays(projection.rays, focal, (0.0, 0.0)))
+            self._projections[id(projection)] = projection, Projection.of(camera, 1)
         return self._projections[id(projection)][1]
 
 

@@ -1,6 +1,7 @@
 """Lenses in the calibration files of other programs.
 
-All have pixel coordinate 0 at the centre of the first pixel, as tofuse does.
+Pixel coordinate 0 is at the centre of the first pixel, as in tofuse; only in nerfstudio's files it
+is at the corner.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ _SIZE = ("image_size", "imageSize", "resolution")
 _WIDTH = ("image_width", "image_Width", "imageWidth", "width", "Camera.width", "w")
 _HEIGHT = ("image_height", "image_Height", "imageHeight", "height", "Camera.height", "h")
 _PREFIXES = ("", "Camera.", "Camera1.")
-_LENS = (("fx", "fl_x"), ("fy", "fl_y"), ("cx", "ppx"), ("cy", "ppy"))
+_NERFSTUDIO = "fl_x"
+_LENS = (("fx", _NERFSTUDIO), ("fy", "fl_y"), ("cx", "ppx"), ("cy", "ppy"))
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 _UNIT, _KIND = "depth_unit_m", "depth_kind"
 _COUNTS = ("DepthMapFactor", "RGBD.DepthMapFactor", "depth_scale")
@@ -179,7 +181,10 @@ class _Keys:
         lens = [self.number(*names) for names in _LENS]
         if None in lens:
             return None
-        return _matrix(tuple(value for value in lens if value is not None))
+        K = _matrix(tuple(value for value in lens if value is not None))
+        if self.number(_NERFSTUDIO) is not None:
+            K[:2, 2] -= 0.5
+        return K
 
     def distortion(self) -> tuple[float, ...]:
         """The coefficients in the order of OpenCV."""

@@ -36,6 +36,8 @@ class Video:
         self._next = 0
         try:
             self._capture: Any = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+            # The orientation that a phone states would turn images relative to their depth.
+            self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
             get = self._capture.get
             self.width, self.height = (
                 int(get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)

@@ -50,6 +50,8 @@ class RecordingWriter:
         See `CameraFile`; None: not written.
     sigma_unit_m
         Metres per count of sigma; None: frames' sigma is not written.
+    amplitude_factor
+        Counts that are written per count of amplitude.
     color_registered
         Whether colour is registered to depth.
     camera_per_frame
@@ -83,6 +85,7 @@ class RecordingWriter:
         serial: str | None = None,
         poses_by: str | None = None,
         sigma_unit_m: float | None = None,
+        amplitude_factor: float = 1.0,
         color_registered: bool = True,
         camera_per_frame: bool = False,
     ) -> None:
@@ -92,6 +95,7 @@ class RecordingWriter:
         self.camera = camera
         self.depth_unit_m, self.depth_kind = depth_unit_m, depth_kind
         self.sigma_unit_m, self.camera_per_frame = sigma_unit_m, camera_per_frame
+        self.amplitude_factor = amplitude_factor
         self.out_of_range = 0
         self._lenses: list[tuple[float, ...]] = []
         self._channels: frozenset[str] | None = None
@@ -231,8 +235,10 @@ class RecordingWriter:
         return np.clip(counts, 0, depth_counts.MAX_COUNTS).astype(np.uint16)
 
     def _amplitude(self, amplitude: Float32) -> UInt16:
-        counts = np.rint(np.nan_to_num(amplitude.astype(float)))
-        overflow = (counts >= SATURATED_AMPLITUDE) & (amplitude != SATURATED_AMPLITUDE)
+        is_saturated = amplitude == SATURATED_AMPLITUDE
+        scaled = np.where(is_saturated, amplitude, self.amplitude_factor * amplitude.astype(float))
+        counts = np.rint(np.nan_to_num(scaled))
+        overflow = (counts >= SATURATED_AMPLITUDE) & ~is_saturated
         self.out_of_range += int(overflow.sum())
         counts[overflow] = SATURATED_AMPLITUDE - 1
         return np.clip(counts, 0, SATURATED_AMPLITUDE).astype(np.uint16)
