@@ -37,6 +37,15 @@ def turning_box(angle: float, background: np.ndarray | float = 3.0) -> tuple[np.
     return np.where(seen, z, background), seen
 
 
+def turning_box_on_table(angle: float) -> tuple[np.ndarray, ...]:
+    """The same pillar on a table at a height at which no jump separates the two."""
+    with np.errstate(divide="ignore"):
+        table = 0.335 / np.maximum(CAMERA.rays()[..., 1].astype(float), 0)
+    pillar, _ = turning_box(angle, np.inf)
+    pillar = np.where(V >= 50, pillar[30], pillar)  # its sides are vertical
+    return np.minimum(pillar, np.where(table < 1.6, table, 3.0)), pillar < table
+
+
 def recording(
     count: int = 16, sigma: float = 0.004, background: np.ndarray | float = 3.0
 ) -> tuple[list[RangeFrame], list[np.ndarray]]:
@@ -107,6 +116,25 @@ def test_static_objects_in_front_are_background() -> None:
     assert min(
         agreement(found.mask(f.z), m) for f, m in zip(frames, masks, strict=True)
     ) > 0.97  # fmt: skip
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("upright", [True, False])
+def test_table_is_not_part_of_what_stands_on_it(upright: bool) -> None:
+    rng = np.random.default_rng(3)
+    camera = (
+        CAMERA if upright else Pinhole(width=ROWS, height=COLUMNS, fx=70, fy=70, cx=29.5, cy=39.5)
+    )
+    frames, masks = [], []
+    for k in range(16):
+        z, mask = turning_box_on_table(2 * np.pi * k / 16 * 0.93)
+        z = z + rng.normal(0, 0.004, z.shape)
+        z, mask = (z, mask) if upright else (z.T, mask.T)
+        frames.append(RangeFrame(k, float(k), camera, np.asarray(z, np.float32)))
+        masks.append(mask)
+    found = moving_object(frames)
+    for image, mask in zip(frames, masks, strict=True):
+        assert agreement(found.mask(image.z), mask) > 0.93
 
 
 def test_background_without_depth() -> None:

@@ -552,6 +552,23 @@ def test_wraps_behind_rotating_object_do_not_affect_verdict(result: tofuse.Resul
     assert turning.recording["findings"] == moving.recording["findings"]
 
 
+def test_object_that_does_not_turn_is_no_good_result(result: tofuse.Result) -> None:
+    """Otherwise a model of the table would be good, with a bound on poses of the table."""
+    bounded = replace(
+        result.diagnostics,
+        verdict="good",
+        accuracy=Accuracy(0.002, 0.001, 0.003, True, WorstFrame(1, 0.03, 0.01)),
+        reasons=(Reason("stood_still", ((0, 2),), "The camera never moved."),),
+    )
+    still = replace(result, diagnostics=bounded)
+    assert with_findings(still, []).diagnostics.verdict == "good"  # a camera on a tripod
+    found = with_findings(still, [], turning=True).diagnostics
+    assert found.verdict == "failed"
+    assert [r.code for r in found.reasons] == ["object_still", "stood_still"]
+    assert "--max-depth" in found.reasons[0].remedy
+    assert not np.isfinite(found.accuracy.position_m)
+
+
 @pytest.mark.parametrize(
     ("code", "harmless", "severe"),
     [

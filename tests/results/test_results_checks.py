@@ -207,10 +207,10 @@ CASES = {
 
 def test_every_reason_has_a_case() -> None:
     # Whether there is a surface is no question of trust: fusion reports it. Faults of the recording
-    # itself are found before it is run; a corrected camera, or one that is not where its rig
-    # states, afterwards.
+    # itself are found before it is run; a corrected camera, one that is not where its rig states,
+    # or an object that does not turn, afterwards.
     elsewhere = {"no_surface", "faulty_recording", "self_calibrated", "correction_left_out"}
-    elsewhere |= {"rig_changed", "uncertain_rig", "inconsistent_poses"}
+    elsewhere |= {"rig_changed", "uncertain_rig", "inconsistent_poses", "object_still"}
     assert set(CASES) == set(REASONS) - elsewhere
 
 

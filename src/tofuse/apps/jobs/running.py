@@ -215,7 +215,8 @@ def with_findings(
 
     Two kinds of faults are ignored: wrapped background behind a turning object, as it is removed,
     and intrinsics that self-calibration has corrected as the finding says. With any other severe
-    fault no bound is stated: its evidence supposes a sound recording.
+    fault no bound is stated: its evidence supposes a sound recording. Nor is one if the object does
+    not turn: the poses are then those of something else.
     """
     indices = [f.index for f in result.diagnostics.frames]
     full_range = ((indices[0], indices[-1]),)
@@ -228,6 +229,9 @@ def with_findings(
         and not _is_corrected(f, calibrated)
     ]
     known, accuracy = result.diagnostics.reasons, result.diagnostics.accuracy
+    if turning and any(reason.code == "stood_still" for reason in known):
+        text = "Nothing turns in the model: it shows what stood still, or the object looks alike "
+        severe.append(Reason("object_still", full_range, f"{text}from all sides."))
     if severe:
         accuracy = accuracy.without_bound()
         known = tuple(reason for reason in known if reason.code != "uncertain_poses")

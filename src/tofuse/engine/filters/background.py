@@ -32,12 +32,18 @@ _JUMP = 0.04
 # A pixel is static if its background is visible in this fraction of the frames, and swept by the
 # object if it is not visible in this fraction.
 _STATIC, _SWEPT = 0.8, 0.04
+# What is visible in a smaller fraction of the frames is mostly hidden.
+_VISIBLE = 0.5
 # Fraction of an image border that must be static.
 _STATIC_BORDER = 0.6
 # Smallest fraction of foreground pixels of an object.
 _MIN_OBJECT = 0.002
 # The object's rim has mixed pixels; its depth is taken from the interior within this distance.
 _FILL_PIXELS = 6
+# A support (table, floor, wall) is a plane of static pixels that covers this fraction of the border
+# of the image. Numbers of samples of three points, and of points that they are tested with.
+_SUPPORT_BORDER, _SAMPLES, _SAMPLED_POINTS = 0.1, 500, 2000
+_MAX_SUPPORTS = 4
 # Smallest fraction of the rim of an object's segment that must continue the passing object.
 _MIN_JOINED = 0.25
 # Foreground components smaller than this fraction of the largest are speckle.
@@ -60,7 +66,8 @@ class Background(Bounded, Filter):
     The background of a pixel is the farthest surface that it measures in several frames, sampled
     over the entire recording. Where the object always occludes the background, that surface belongs
     to the object: its depth differs from the surroundings, and continues the object at neighbouring
-    pixels.
+    pixels, or is as near as the object and mostly hidden. A plane that reaches the border of the
+    image, such as a table, is background.
 
     Attributes
     ----------
@@ -249,16 +256,26 @@ def moving_object(
     if observed.any():
         _check_static(background, frequency)
     interior = np.stack([ndimage.binary_erosion(image, np.ones((3, 3))) for image in front])
-    always_occluded = _always_occluded(
-        ndimage.median_filter(background_z, 3), _filled(_median(z, interior)), frequency
-    )
+    smooth_z = ndimage.median_filter(background_z, 3)
+    unswept = (background.static_fraction >= _STATIC) & (frequency <= _SWEPT)
+    rays = frames[0].camera.rays().astype(float)
+    finite_z = np.where(np.isfinite(smooth_z), smooth_z, 0)
+    points = np.dstack([rays, np.ones(finite_z.shape)]) * finite_z[..., None]
+    supports = _supports(points, unswept, relative)
+    always_occluded = _always_occluded(smooth_z, supports, _filled(_median(z, interior)), frequency)
+    if interior.any():
+        # What is as near as the object, but mostly hidden, is the object's farthest surface.
+        near, far = np.percentile(z[interior], _DEPTH_PERCENTILES)
+        as_near = background_z <= far + _MARGIN * (far - near)
+        always_occluded |= as_near & (background.static_fraction < _VISIBLE)
+    always_occluded &= supports == 0
     limit[always_occluded] = np.inf
     depths = np.concatenate(
         [z[interior], background.z[always_occluded & observed & (background.z > 0)]]
     )
     low, high = np.percentile(depths, _DEPTH_PERCENTILES) if len(depths) else (0.0, np.inf)
     segmentation = MovingObject(background, limit, always_occluded, (float(low), float(high)))
-    _check_complete([segmentation.mask(image) for image in z], z)
+    _check_complete([segmentation.mask(image) for image in z], z, supports > 0)
     return segmentation
 
 
@@ -304,13 +321,16 @@ def _check_static(background: BackgroundSurface, frequency: Float64) -> None:
         )
     if frequency.mean() < _MIN_OBJECT:
         raise InputError(
-            "nothing moves in front of the background", where=_OPTION, remedy=_LEAVE + _CUT
+            "nothing moves in front of the background, or what turns looks alike from all sides",
+            where=_OPTION,
+            remedy=_LEAVE + _CUT,
         )
 
 
-def _check_complete(masks: Sequence[Bool], z: Float32) -> None:
+def _check_complete(masks: Sequence[Bool], z: Float32, support: Bool) -> None:
     """Refuse an object of which only parts or the rim were segmented."""
-    outline = float(np.mean([_outline(mask, image) for mask, image in zip(masks, z, strict=True)]))
+    outlines = [_outline(mask, image, support) for mask, image in zip(masks, z, strict=True)]
+    outline = float(np.mean(outlines))
     interior = sum(int(ndimage.binary_erosion(mask, np.ones((3, 3))).sum()) for mask in masks)
     if outline < _MIN_OUTLINE or interior < _MIN_INNER * np.sum(masks):
         raise InputError(
@@ -318,15 +338,49 @@ def _check_complete(masks: Sequence[Bool], z: Float32) -> None:
         )
 
 
-def _always_occluded(z: Float32, passing: Float32, frequency: Float64) -> Bool:
+def _supports(points: Float64, unswept: Bool, relative: float) -> Int32:
+    """Label the pixels (H, W) on planes that the object may touch, from 1; 0 elsewhere.
+
+    Where it stands on a table, no jump of the depth separates the two. Such a plane is seen next to
+    the object, reaches the border of the image, and is flat: its `points` (H, W, 3) agree to the
+    fraction `relative` of their depth.
+    """
+    label = np.zeros(unswept.shape, np.int32)
+    border = np.ones(unswept.shape, bool)
+    border[1:-1, 1:-1] = False
+    usable = unswept & np.isfinite(points).all(2) & (points[..., 2] > 0)
+    rng = np.random.default_rng(0)
+    for support in range(1, _MAX_SUPPORTS + 1):
+        free = points[usable & (label == 0)]
+        reaching = points[usable & (label == 0) & border]
+        if len(reaching) < _SUPPORT_BORDER * np.count_nonzero(border):
+            break
+        free = rng.choice(free, _SAMPLED_POINTS)
+        # Two points at the border, as the plane has to reach it. It consists of the x with n x = 1.
+        triples = [rng.choice(each, _SAMPLES) for each in (reaching, reaching, free)]
+        normals = np.linalg.pinv(np.stack(triples, 1)).sum(2)
+        agreeing = np.abs(free @ normals.T - 1) <= relative
+        best = free[agreeing[:, np.argmax(agreeing.sum(0))]]
+        normal = np.linalg.lstsq(best, np.ones(len(best)), rcond=None)[0]
+        on_plane = (label == 0) & (np.abs(points @ normal - 1) <= relative)
+        # Not where the plane happens to meet the object elsewhere.
+        parts, _ = ndimage.label(on_plane)
+        on_plane &= np.isin(parts, parts[on_plane & border])
+        if np.count_nonzero(on_plane & border) < _SUPPORT_BORDER * np.count_nonzero(border):
+            break
+        label[on_plane] = support
+    return label
+
+
+def _always_occluded(z: Float32, apart: Int32, passing: Float32, frequency: Float64) -> Bool:
     """Mask (H, W) where the far surface z is the object: it always occludes the background.
 
-    Such a segment of the far surface is nearer than the adjacent segments. Where the object passes
-    in front of these (in the fraction `frequency` of the frames), its depth (`passing`, 0 where
-    unknown) is close to that of the segment. Only part of the rim must satisfy this: the object may
-    stand on a support.
+    A segment of the object, apart from what it touches by the labels `apart`, is nearer than the
+    adjacent segments. Where the object passes in front of these (in the fraction `frequency` of the
+    frames), its depth (`passing`, 0 where unknown) is close to that of the segment. Only part of
+    the rim must satisfy this: the object may stand on a support.
     """
-    label = _segments(z)
+    label = _segments(z, apart)
     count = int(label.max()) + 1
     rim, joined = np.zeros(count), np.zeros(count)
     for a, b in NEIGHBOURS:
@@ -353,10 +407,11 @@ def _filled(z: Float32) -> Float32:
     return np.where(distance <= _FILL_PIXELS, z[tuple(nearest)], np.float32(0))
 
 
-def _segments(z: Float32) -> Int32:
+def _segments(z: Float32, apart: Int32) -> Int32:
     """Label the segments of a depth image (H, W) without jumps, from 1; 0 where z is 0.
 
-    Pixels at a jump belong to the segment on their side of it.
+    Pixels with different labels `apart` are not connected. Pixels at a jump belong to the segment
+    on their side of it.
     """
 
     def connected(a: Float32, b: Float32) -> Bool:
@@ -364,7 +419,9 @@ def _segments(z: Float32) -> Int32:
             alike = np.abs(a - b) <= _JUMP * np.minimum(a, b)
         return (alike | (np.isinf(a) & np.isinf(b))) & (a > 0) & (b > 0)
 
-    label = parts_of_image(z.shape, (connected(z[a], z[b]) for a, b in NEIGHBOURS))
+    label = parts_of_image(
+        z.shape, (connected(z[a], z[b]) & (apart[a] == apart[b]) for a, b in NEIGHBOURS)
+    )
     return np.where(z > 0, label + 1, 0).astype(np.int32)
 
 
@@ -378,15 +435,17 @@ def _without_speckle(mask: Bool) -> Bool:
     return np.asarray((size >= _SPECKLE * size.max())[label] & mask)
 
 
-def _outline(mask: Bool, z: Float32) -> float:
-    """Fraction of a mask's outline at which the surface ends: a jump, or no measurement."""
+def _outline(mask: Bool, z: Float32, support: Bool) -> float:
+    """Fraction of a mask's outline at which the surface ends.
+
+    There is a jump of the depth z, no measurement, or what the object stands on (`support`).
+    """
     total = ends = 0
     for a, b in NEIGHBOURS:
         for p, q in ((a, b), (b, a)):
             rim = mask[p] & ~mask[q]
             inside, outside = z[p][rim], z[q][rim]
+            jump = np.abs(outside - inside) > _JUMP * inside
             total += len(inside)
-            ends += int(
-                np.count_nonzero((outside <= 0) | (np.abs(outside - inside) > _JUMP * inside))
-            )
+            ends += int(np.count_nonzero((outside <= 0) | jump | support[q][rim]))
     return ends / total if total else 1.0

@@ -12,6 +12,7 @@ from tofuse.engine.results.types import Reason, Verdict
 REASONS: dict[str, tuple[str, str]] = {
     "few_poses": ("failed", "Fewer than half of the readable frames are in the main model."),
     "images_disagree": ("failed", "Most overlapping measurements contradict the poses."),
+    "object_still": ("failed", "The object of `--object` was not seen to turn."),
     "lost_frames": ("degraded", "Some readable frames have no pose."),
     "disconnected": ("degraded", "The recording consists of disconnected parts."),
     "bridged_gap": ("degraded", "Parts are connected over a gap without overlap."),
@@ -78,6 +79,8 @@ _REMEDIES: dict[str, str] = {
     "few_poses": "Record again with smaller steps between frames, or use every frame.",
     "images_disagree": "Look at the model from above: a wall that appears twice shows where "
     "tracking failed.",
+    "object_still": "Leave only what turns in view, by --max-depth, a box or a mask; a round "
+    "object needs texture or colour.",
     "lost_frames": "Move more slowly there, and keep corners and furniture in view.",
     "disconnected": "Record again with overlap between these parts, or use them as separate "
     "models.",
