@@ -230,8 +230,8 @@ def with_findings(
     ]
     known, accuracy = result.diagnostics.reasons, result.diagnostics.accuracy
     if turning and any(reason.code == "stood_still" for reason in known):
-        text = "Nothing turns in the model: it shows what stood still, or the object looks alike "
-        severe.append(Reason("object_still", full_range, f"{text}from all sides."))
+        text = "Nothing in the model turned: it stood still, or looks the same from all sides."
+        severe.append(Reason("object_still", full_range, text))
     if severe:
         accuracy = accuracy.without_bound()
         known = tuple(reason for reason in known if reason.code != "uncertain_poses")

@@ -321,7 +321,7 @@ def _check_static(background: BackgroundSurface, frequency: Float64) -> None:
         )
     if frequency.mean() < _MIN_OBJECT:
         raise InputError(
-            "nothing moves in front of the background, or what turns looks alike from all sides",
+            "nothing moves in front of the background, or the object looks the same from all sides",
             where=_OPTION,
             remedy=_LEAVE + _CUT,
         )

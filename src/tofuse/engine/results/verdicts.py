@@ -79,8 +79,8 @@ _REMEDIES: dict[str, str] = {
     "few_poses": "Record again with smaller steps between frames, or use every frame.",
     "images_disagree": "Look at the model from above: a wall that appears twice shows where "
     "tracking failed.",
-    "object_still": "Leave only what turns in view, by --max-depth, a box or a mask; a round "
-    "object needs texture or colour.",
+    "object_still": "Keep only the turning object in view, by --max-depth, a box or a mask; "
+    "a round object needs texture or colour.",
     "lost_frames": "Move more slowly there, and keep corners and furniture in view.",
     "disconnected": "Record again with overlap between these parts, or use them as separate "
     "models.",

@@ -334,7 +334,7 @@ def _write_layout(recording: Recording, folder: Path, layout: Layout) -> tuple[i
         warnings.append("there is neither colour nor amplitude: colour images are black")
     if unregistered:
         warnings.append(
-            "colour is not registered to depth, but other programs take it to be in these layouts"
+            "colour is not registered to depth, but programs that read these layouts assume it is"
         )
     if out_of_range:
         farthest = depth_counts.MAX_COUNTS / COUNTS_PER_M[layout]
