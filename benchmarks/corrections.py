@@ -5,8 +5,8 @@ calibrated and by cameras whose stated focal length, principal point or range is
 reconstructed as by default, and if that corrects multipath (`sensor.multipath_correction`) or the
 calibration (`mapping.self_calibration`), once more without any correction. A row has what was wrong
 and what was corrected, the rms errors of the poses without and with the corrections, and the stated
-bounds. The table at the end counts, by what was wrong, the corrected runs and those in which the
-error is more than 10 % larger with the corrections than without.
+bounds. The table at the end counts, by what was wrong, the corrected runs, those in which the error
+is more than 10 % larger with the corrections than without, and errors beyond their bounds.
 
     python benchmarks/corrections.py [--seeds 41] [--families phone room] [--cases calibrated]
 """
@@ -64,13 +64,18 @@ class Row:
         """Whether the corrections make the poses worse by more than 10 %."""
         return self.errors_m[1] > WORSE * self.errors_m[0]
 
+    @property
+    def outside(self) -> bool:
+        """Whether the error with the corrections exceeds its bound."""
+        return self.errors_m[1] > self.bounds_m[1]
+
     def __str__(self) -> str:
         """Format as a row of the table."""
         errors, bounds = (
             " / ".join(f"{1e3 * value:.1f}" for value in pair)
             for pair in (self.errors_m, self.bounds_m)
         )
-        mark = "WORSE" if self.worse else ""
+        mark = " ".join(["WORSE"] * self.worse + ["OUTSIDE"] * self.outside)
         return (
             f"| {self.name} | {self.case} | {', '.join(self.corrected) or '-'} | {errors} "
             f"| {bounds} | {mark} |"
@@ -128,9 +133,9 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
     """Yield the table by what was wrong."""
     yield (
         "| camera | runs | corrected | better | more than 10 % worse | median error of the "
-        "corrected, mm: without, with |"
+        "corrected, mm: without, with | outside the bound |"
     )
-    yield "|---" * 6 + "|"
+    yield "|---" * 7 + "|"
     for case in [*dict.fromkeys(row.case for row in rows), "all"]:
         own = [row for row in rows if case in (row.case, "all")]
         corrected = [row for row in own if row.corrected]
@@ -139,7 +144,8 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
         yield (
             f"| {case} | {len(own)} | {len(corrected)} | {better} "
             f"| {sum(row.worse for row in corrected)} "
-            f"| {', '.join(f'{1e3 * median:.1f}' for median in medians)} |"
+            f"| {', '.join(f'{1e3 * median:.1f}' for median in medians)} "
+            f"| {sum(row.outside for row in own)} |"
         )
 
 
