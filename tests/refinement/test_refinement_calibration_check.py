@@ -109,6 +109,15 @@ def test_error_that_may_be_usual_raises_no_alarm(monkeypatch):
     assert found.is_likely  # the bound includes it
 
 
+@pytest.mark.nightly_part
+def test_of_models_about_as_likely_the_one_by_which_views_agree_best_counts(monkeypatch):
+    views, refined = kept(0.06)
+    likely = property(lambda self: ["distortion", "focal", "offset"])
+    monkeypatch.setattr(calibration_check._Estimate, "likely", likely)
+    found = check_calibration(RefinedViews(views, refined, OPTIONS))
+    assert found.errors == {"offset": pytest.approx(0.06, abs=0.015)}
+
+
 def test_correct_camera_raises_no_alarm():
     views, refined = kept(0.0)
     found = check_calibration(RefinedViews(views, refined, OPTIONS))

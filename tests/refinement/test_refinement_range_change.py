@@ -145,9 +145,8 @@ def test_error_of_the_camera_that_differs_over_the_image_is_no_change() -> None:
     sampled = [SampledView.of(view, 1500) for view in views]
     check = check_calibration(RefinedViews(sampled, refine(sampled, poses, OPTIONS), OPTIONS))
     assert check.range_change is None
-    # Poses follow it nevertheless.
-    assert check.changed[0] > 0
-    assert check.change_confirmed
+    # Poses follow it nevertheless; whether successive views differ enough to confirm it, is chance.
+    assert check.changed[0] > 0.004
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.8])

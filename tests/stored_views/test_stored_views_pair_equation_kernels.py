@@ -67,6 +67,43 @@ def test_camera_error_changes_gradient_as_predicted_by_hessian(
     assert np.abs((slope - column)[chosen] / scale).max() < tolerance
 
 
+WIDE = (0.0, 1.0, 0.02, 0.3, 50.0, 0.5)  # so wide that the robust weights are 1
+DISTANCES_ONLY = (*WIDE[:2], 0.0, *WIDE[3:])
+
+
+def of_albedo(source, target, T, *estimated, assumed=0.0):
+    """H and g of the albedo alone; the first of the estimated errors is assumed to have a value."""
+    errors, known = np.zeros(kernels.ERRORS), KNOWN.copy()
+    known[[*estimated]] = 0
+    errors[estimated[0]] = assumed
+    (H, g), (H_distance, g_distance) = (
+        unpack(evaluate(source, target, T, errors, known, settings))
+        for settings in (WIDE, DISTANCES_ONLY)
+    )
+    return H - H_distance, g - g_distance
+
+
+# Those that views side by side don't share.
+RESPONDING = [
+    (kernels.OFFSET, kernels.SOURCE_OFFSET),
+    (kernels.SCALE, kernels.SOURCE_SCALE),
+    (kernels.FOCAL, kernels.FOCAL),
+]
+
+
+@pytest.mark.parametrize("kind", ["z", "range"])
+@pytest.mark.parametrize(("error", "of_source"), RESPONDING)
+def test_response_of_albedo_to_an_error_is_its_slope(kind, error, of_source):
+    """The range of the target does not count: its albedo is that of a ray."""
+    T = se3.exp(np.array([0.1, 0.02, 0.0, 0.0, 0.0, 0.0]))
+    source, target = (as_measured(corner(at, waves=0.3), kind) for at in (T, np.eye(4)))
+    H, _ = of_albedo(source, target, T, error, of_source)
+    ends = [of_albedo(source, target, T, error, assumed=e)[1] for e in (1e-3, -1e-3)]
+    slope = (ends[0] - ends[1]) / 2e-3
+    assert H[7 + error, 7 + error] == pytest.approx(slope[7 + error], rel=0.05)
+    assert H[7 + of_source, 7 + error] == pytest.approx(slope[7 + error], rel=0.05)
+
+
 @pytest.mark.parametrize("error", range(kernels.SOURCE_SCALE))
 def test_large_error_has_no_effect_between_equal_views(error):
     """Its displacements cancel: else the estimate of an error would run away from a large one."""

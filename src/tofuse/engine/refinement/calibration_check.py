@@ -224,7 +224,7 @@ def check_calibration(aligned: RefinedViews) -> CalibrationCheck:
     views, pairs, options = thinned(aligned.views, refined.pairs, aligned.options)
     linearised = Linearised.of(views, refined.poses, pairs, options, aligned.priors)
     first = _Estimate.of(linearised)
-    usual = replace(first, found=first.if_usual, unusual="")
+    usual = replace(first, unusual="")
     without_error = _by_first_estimate(aligned, linearised, usual)
     if len(views) < _MIN_VIEWS or without_error.range_change is not None:
         return without_error
@@ -263,30 +263,29 @@ class _Estimate:
     ----------
     poses
         (N, 4, 4) of the views.
-    found, if_usual
-        The errors, K in all: of the likelier model, and if all are usual.
+    models
+        The errors, K in all, by the name of the one that is not usual; empty if all are.
     follow
         (K, N, 6) twists by which the poses follow, per unit of each error.
     prior_weight
         Factor of the priors of the errors in reweighted least squares.
     unusual
-        Name of the error that is not usual, empty if all are.
+        Name of the likeliest model, "" without strong evidence for another.
     drift
         A drift by a distance that is not usual, and its position among the errors, if one is far
         likelier, beside that error.
     """
 
     poses: Float64
-    found: Posterior
-    if_usual: Posterior
+    models: dict[str, Posterior]
     follow: Float64
     prior_weight: float
     unusual: str
     drift: tuple[int, RangeChange] | None
 
     @classmethod
-    def of(cls, linearised: Linearised) -> _Estimate:
-        """Estimate all errors."""
+    def of(cls, linearised: Linearised, preferred: str = "") -> _Estimate:
+        """Estimate all errors, by the preferred model unless another one is far likelier."""
         views = linearised.state.views
         drifts = drifts_of(views)
         shared = linearised.shared_errors(list(_INDEX.values()), drifts)
@@ -295,10 +294,27 @@ class _Estimate:
         models = {name: shared.posterior(sigmas) for name, sigmas in usual.items()}
         best = max(models, key=lambda name: models[name].evidence)
         drift = _likely_drift(shared, usual.values(), models[best].evidence, drifts, linearised)
-        if models[best].evidence - models[""].evidence < _STRONG:
-            best = ""
         weight = shared.dispersion / linearised.curvature
-        return cls(linearised.poses, models[best], models[""], shared.motion, weight, best, drift)
+        found = cls(linearised.poses, models, shared.motion, weight, best, drift)
+        likely = found.likely
+        return replace(found, unusual=preferred if preferred in likely else likely[0])
+
+    @property
+    def likely(self) -> list[str]:
+        """Names of models that are about as likely as the likeliest, which comes first.
+
+        Without strong evidence for another one, all errors are usual.
+        """
+        evidence = {name: model.evidence for name, model in self.models.items()}
+        least = max(evidence.values()) - _STRONG
+        if evidence[""] > least:
+            return [""]
+        return sorted((n for n, e in evidence.items() if e > least), key=lambda n: -evidence[n])
+
+    @property
+    def found(self) -> Posterior:
+        """The errors by the likeliest model."""
+        return self.models[self.unusual]
 
     @property
     def by_name(self) -> dict[str, tuple[float, float]]:
@@ -369,12 +385,14 @@ def _likely_drift(
     # What poses have not taken up of a large drift is no noise: the weights stay as they are.
     step = linearised.curvature
     chance = significance_of(shared.independent[k]) * shared.serial_sigma[k]
+    section_sigma = linearised.section_sigma(drifts[[k - len(_INDEX)]], in_metres=True)
     change = RangeChange(
         -step * float(found.errors[k]),
         step * float(np.sqrt(found.covariance[k, k])),
         frame=None,
         limit=_CERTAIN,
         confirmed=bool(abs(found.errors[k]) > chance),
+        in_all_sections=bool(abs(found.errors[k]) > significance_of(SECTIONS) * section_sigma),
         recording=recording_of(first, views),
         in_metres=True,
     )
@@ -418,11 +436,14 @@ def _check_promising(
     aligned: RefinedViews, estimator: _Estimator, without_error: CalibrationCheck
 ) -> CalibrationCheck:
     """Estimate the errors in full, and check whether views, loops and odometry confirm them."""
-    fit = estimator.estimate()
-    support = estimator.support_of(fit)
-    if support[1] < support[0]:  # the first estimate led astray
+    # Linearised, models that resemble each other may be about equally likely.
+    fits = {name: estimator.estimate(name) for name in estimator.likely}
+    supports = {name: estimator.support_of(fit) for name, fit in fits.items()}
+    best = max(supports, key=lambda name: supports[name][1])
+    fit, support = fits[best], supports[best]
+    if support[1] < support[0]:  # the first estimates led astray
         return _check_by_loop(aligned, without_error)
-    estimate = _Estimate.of(_linearised(fit, aligned.priors))
+    estimate = _Estimate.of(_linearised(fit, aligned.priors), best)
     name, estimates = estimate.unusual, estimate.by_name
     is_large = name != "" and abs(estimates[name][0]) > TOLERANCES[name]
     check = replace(
@@ -454,7 +475,7 @@ class _Estimator:
 
     def __init__(self, aligned: RefinedViews, linearised: Linearised, first: _Estimate) -> None:
         refined, state = aligned.refined, linearised.state
-        self._views, self._first = state.views, first
+        self._first, self.likely = first, first.likely
         self._options = replace(state.options, rounds=COARSE_TO_FINE[-1:])
         self._align = partial(
             align_views,
@@ -467,12 +488,12 @@ class _Estimator:
         # compared with the refined poses.
         self.poses = self._align(refined.poses, replace(self._options, rounds=_REALIGNMENT)).poses
 
-    def estimate(self) -> AlignedViews:
-        """Estimate the errors in full."""
-        first, options, poses = self._first, self._options, self.poses
+    def estimate(self, unusual: str) -> AlignedViews:
+        """Estimate the errors in full by one model, see `_Estimate.models`."""
+        first, options, poses = replace(self._first, unusual=unusual), self._options, self.poses
         calibrate, errors = list(_INDEX.values()), np.zeros(kernels.ERRORS)
         usual = np.full(kernels.ERRORS, np.inf)
-        usual[calibrate] = _sigmas(first.unusual) / np.sqrt(first.prior_weight)
+        usual[calibrate] = _sigmas(unusual) / np.sqrt(first.prior_weight)
         if np.abs(first.found.errors).max() > _MAX_DIRECT * max(TOLERANCES.values()):
             options = replace(options, rounds=COARSE_TO_FINE)
         else:

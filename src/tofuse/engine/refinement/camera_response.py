@@ -29,6 +29,9 @@ SECTIONS = 8
 # Significance of an error in standard deviations of a normal distribution.
 SIGNIFICANT = 4.0
 _ESTIMATE_ALL = np.zeros(kernels.ERRORS, np.int64)
+# Errors of the source view alone, and of all views.
+_OFFSETS = kernels.SOURCE_OFFSET, kernels.OFFSET
+_SCALES = kernels.SOURCE_SCALE, kernels.SCALE
 _MAX_CORRELATION = 0.97  # of errors of successive views
 
 
@@ -286,9 +289,8 @@ class Linearised:
         """
         columns = np.tile(np.eye(kernels.ERRORS)[:, errors], (len(self.H), 1, 1))
         if changes is not None:
-            offsets = self._changing(changes, kernels.SOURCE_OFFSET, kernels.OFFSET)
-            scales = self._changing(changes, kernels.SOURCE_SCALE, kernels.SCALE)
-            columns = np.concatenate([columns, offsets, scales], 2)
+            changing = [self._changing(changes, *kind) for kind in (_OFFSETS, _SCALES)]
+            columns = np.concatenate([columns, *changing], 2)
         motion, along = self._along(columns)
         first, second = self._derivatives(self.H, self.g, along)
         gradient = first.sum(0)
@@ -318,8 +320,7 @@ class Linearised:
 
     def response_to_scales(self, profiles: Float64) -> Response:
         """Return the response to the scale of the depth by profiles (K, N) over the views."""
-        scales = self._changing(profiles, kernels.SOURCE_SCALE, kernels.SCALE)
-        motion, along = self._along(scales)
+        motion, along = self._along(self._changing(profiles, *_SCALES))
         first, second = self._derivatives(self.H, self.g, along)
         return Response(first, np.diagonal(second, axis1=1, axis2=2), motion)
 
@@ -352,13 +353,15 @@ class Linearised:
         columns[:, of_all] = of_target
         return columns
 
-    def section_sigma(self, profile: Float64) -> float:
-        """Standard deviation of the scale by a profile (1, N), from the scatter between sections.
+    def section_sigma(self, profile: Float64, *, in_metres: bool = False) -> float:
+        """Standard deviation of a change by a profile (1, N), from the scatter between sections.
 
-        An error that differs over the image is no change of the range, though with steady motion
-        views drift apart by it: what enters on one side leaves on the other.
+        Of the scale, or of the range in m. An error that differs over the image is no change of the
+        range, though with steady motion views drift apart by it: what enters on one side leaves on
+        the other.
         """
-        _, along = self._along(self._changing(profile, kernels.SOURCE_SCALE, kernels.SCALE))
+        of_source, of_all = _OFFSETS if in_metres else _SCALES
+        _, along = self._along(self._changing(profile, of_source, of_all))
         first, second = (x.sum(0) for x in self._derivatives(self.H, self.g, along))
         scatter = _scatter(self._of_sections(along, -first / second[0]))
         return float(np.sqrt(scatter[0, 0]) / max(second[0, 0], 1e-12))

@@ -374,9 +374,11 @@ def _respond_to_errors(
     r20, r21, r22 = np.float32(T[2, 0]), np.float32(T[2, 1]), np.float32(T[2, 2])
     one, zero, tiny = np.float32(1), np.float32(0), np.float32(_EPSILON)
     radial_p = one if radial_source else zero
-    # The albedo of the target depends on the ray alone.
-    radial_q = one if radial_target and is_distance else zero
-    range_q = one if is_distance else zero
+    radial_q = one if radial_target else zero
+    # The albedo of a pixel is that of its ray, whatever its range. Neither gradient has a part
+    # along the rays of its own image: with their mean, the response to the range of the source
+    # alone is that to a common one.
+    from_q = zero if is_distance else one
     for k in range(residual.LANES):
         m0 = block[residual.JACOBIAN * residual.LANES + k]
         m1 = block[(residual.JACOBIAN + 1) * residual.LANES + k]
@@ -407,11 +409,11 @@ def _respond_to_errors(
         steep_q = bend_q * across_q / max(qz * qz, tiny) + longer_q * kept_q
         center_p = pz / projection_kernels.distortion(rho2_p, lens)
         center_q = qz / projection_kernels.distortion(rho2_q, lens)
-        per_metre_p, per_metre_q = along_p / np.sqrt(p2), range_q * along_q / np.sqrt(q2)
+        per_metre_p, per_metre_q = along_p / np.sqrt(p2), along_q / np.sqrt(q2)
         block[(_RESPONSE + OFFSET) * residual.LANES + k] = per_metre_p - per_metre_q
-        block[(_RESPONSE + SOURCE_OFFSET) * residual.LANES + k] = per_metre_p
-        block[(_RESPONSE + SCALE) * residual.LANES + k] = along_p - range_q * along_q
-        block[(_RESPONSE + SOURCE_SCALE) * residual.LANES + k] = along_p
+        block[(_RESPONSE + SOURCE_OFFSET) * residual.LANES + k] = per_metre_p - from_q * per_metre_q
+        block[(_RESPONSE + SCALE) * residual.LANES + k] = along_p - along_q
+        block[(_RESPONSE + SOURCE_SCALE) * residual.LANES + k] = along_p - from_q * along_q
         block[(_RESPONSE + FOCAL) * residual.LANES + k] = longer_p * scaled_p - longer_q * scaled_q
         block[(_RESPONSE + CENTER_X) * residual.LANES + k] = center_p * (
             m0 - px * steep_p
