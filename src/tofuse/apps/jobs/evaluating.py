@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -111,39 +111,10 @@ def evaluate(
         for source, name in ((estimate, "estimate"), (reference, "reference"))
     ]
     of_estimate, _ = _result_of(estimate), _result_of(reference)
-    clock = None
-    if isinstance(estimate, Reconstruction):
-        indices = np.array([frame.index for frame in estimate.diagnostics.frames], np.intp)
-        clock = estimate.timestamps, indices
-    elif of_estimate is not None and of_estimate.folder == Path(str(estimate)):
-        clock = of_estimate.clock
-    if recording is not None:
-        clock = recording.timestamps, recording.indices
-    timed = _poses(estimate, names[0]), _poses(reference, names[1], is_reference=True)
-    by_frame = [poses.timestamps is None for poses in timed]
-    if clock is None and sum(by_frame) == 1:
-        clock = _clock_of_recording(reference if by_frame[0] else estimate)
-    if clock is None and sum(by_frame) == 1:
-        raise InputError(
-            "has poses by frame, the other file by time",
-            where=names[by_frame.index(True)],
-            remedy="pass the recording, which has the times (--recording)",
-        )
-    arrays = [isinstance(source, np.ndarray) for source in (estimate, reference)]
-    if all(arrays) and len(timed[0].poses) != len(timed[1].poses):
-        raise InputError(
-            f"hold {len(timed[0].poses)} and {len(timed[1].poses)} poses",
-            where=", ".join(names),
-            remedy="pass poses of the same frames, NaN where there is none",
-        )
-    times, poses = _timed(timed[0], estimate, clock, names[0])
-    reference_times, reference_poses = _timed(timed[1], reference, clock, names[1])
-    # About the clouds: errors of rotation have long lever arms at the origin of map coordinates.
-    if isinstance(estimate, Reconstruction):  # which is so already
-        reference_poses = se3.about(-estimate.shift, reference_poses)
-    elif of_estimate is not None:
-        shift = run_json.shift_of(of_estimate.run, of_estimate.folder / "run.json")
-        poses, reference_poses = se3.about(-shift, poses), se3.about(-shift, reference_poses)
+    (times, poses), (reference_times, reference_poses) = _associable(
+        estimate, reference, recording, of_estimate, names
+    )
+    poses, reference_poses = _about_cloud(poses, reference_poses, estimate, of_estimate)
     frame_times = None if recording is None else recording.timestamps
     try:
         error = trajectory_errors.evaluate_trajectory(
@@ -166,9 +137,8 @@ def evaluate(
     consistency = None
     if recording is not None:
         frame_poses = associated_poses(recording.timestamps, times, poses)
-        consistency = map_agreement.map_consistency(
-            recording, frame_poses, correctors=_correctors(estimate, of_estimate, config)
-        )
+        correctors = _correctors(estimate, of_estimate, config)
+        consistency = map_agreement.map_consistency(recording, frame_poses, correctors=correctors)
         if consistency.inlier_ratio < _MIN_INLIERS:
             notes.append(
                 f"only {percent(consistency.inlier_ratio)} of the points of the images agree at "
@@ -232,6 +202,66 @@ def _poses(source: Poses, name: str, *, is_reference: bool = False) -> TimedPose
         return TimedPoses(source.reference, timestamps=source.timestamps)
     poses = se3.check_poses(source, where=name)
     return TimedPoses(poses, frames=np.arange(len(poses)))
+
+
+def _associable(
+    estimate: Poses,
+    reference: Poses,
+    recording: Recording | None,
+    of_estimate: _Result | None,
+    names: Sequence[str],
+) -> list[tuple[Float64, Float64]]:
+    """Return times (N,) and poses (N, 4, 4) of the estimate and of the reference.
+
+    Poses by frame have the times of the recording, or else those of the result or the recording
+    that the poses are of.
+    """
+    timed = _poses(estimate, names[0]), _poses(reference, names[1], is_reference=True)
+    by_frame = [poses.timestamps is None for poses in timed]
+    clock = _clock(estimate, recording, of_estimate)
+    if clock is None and sum(by_frame) == 1:
+        clock = _clock_of_recording(reference if by_frame[0] else estimate)
+        if clock is None:
+            raise InputError(
+                "has poses by frame, the other file by time",
+                where=names[by_frame.index(True)],
+                remedy="pass the recording, which has the times (--recording)",
+            )
+    are_arrays = isinstance(estimate, np.ndarray) and isinstance(reference, np.ndarray)
+    if are_arrays and len(timed[0].poses) != len(timed[1].poses):
+        raise InputError(
+            f"hold {len(timed[0].poses)} and {len(timed[1].poses)} poses",
+            where=", ".join(names),
+            remedy="pass poses of the same frames, NaN where there is none",
+        )
+    sources = estimate, reference
+    return [_timed(t, s, clock, name) for t, s, name in zip(timed, sources, names, strict=True)]
+
+
+def _clock(
+    estimate: Poses, recording: Recording | None, of_estimate: _Result | None
+) -> Clock | None:
+    """Return the times of frames, of the recording if it is given."""
+    if recording is not None:
+        return recording.timestamps, recording.indices
+    if isinstance(estimate, Reconstruction):
+        indices = np.array([frame.index for frame in estimate.diagnostics.frames], np.intp)
+        return estimate.timestamps, indices
+    is_result = of_estimate is not None and of_estimate.folder == Path(str(estimate))
+    return of_estimate.clock if of_estimate is not None and is_result else None
+
+
+def _about_cloud(
+    poses: Float64, reference: Float64, estimate: Poses, of_estimate: _Result | None
+) -> tuple[Float64, Float64]:
+    """Return both poses about the cloud of the result: rotations have long lever arms at the origin
+    of map coordinates."""
+    if isinstance(estimate, Reconstruction):  # which is so already
+        return poses, se3.about(-estimate.shift, reference)
+    if of_estimate is None:
+        return poses, reference
+    shift = run_json.shift_of(of_estimate.run, of_estimate.folder / "run.json")
+    return se3.about(-shift, poses), se3.about(-shift, reference)
 
 
 def _timed(

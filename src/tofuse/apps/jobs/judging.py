@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -210,17 +210,7 @@ def judge(
         recording = open_recording(recording)
     check_one_camera(recording)
     given_poses = poses_for(recording, trajectory)
-    kind = reconstructing.view_kind(recording)
-    if kind == "cloud":
-        raise InputError(
-            "contains clouds, and poses are judged by depth images",
-            where=recording.path,
-            remedy="compare the poses with a reference: tofuse evaluate",
-        )
-    # External sensors do not measure these poses, and images are compared with the stated camera.
-    config = replace(
-        from_method("default", kind), tolerance_m=tolerance_m, priors=(), self_calibration=False
-    )
+    config = _config(recording, tolerance_m)
     given_config = replace(
         config, odometry=given.GivenPoses(), refinement=Joint(neighbours=_NEIGHBOURS)
     )
@@ -254,29 +244,22 @@ def judge(
     stated = _stated_accuracy(trajectory)
     if stated is not None and _holds(stated, accuracy, sampled.diagnostics.accuracy, deviation):
         accuracy = stated
-    reasons = verdicts.ranked(
-        [
-            *_reasons(
-                recording,
-                poses,
-                refined.poses,
-                accuracy,
-                (deviation, cause),
-                (as_given, refined.compared),
-                checks.tolerance_of(tolerance_m, sampled.cloud.diagonal_m),
-            )
-        ]
+    found = _reasons(
+        recording,
+        poses,
+        refined.poses,
+        accuracy,
+        (deviation, cause),
+        (as_given, refined.compared),
+        checks.tolerance_of(tolerance_m, sampled.cloud.diagonal_m),
     )
-
-    def reconstruct() -> Reconstruction:
-        source, config_used = recording, config
-        if refined.started:
-            # Frames to which no pose was given are not lost.
-            posed = recording.indices[np.isfinite(poses).all((1, 2))]
-            source = replace(adaptation.with_odometry(recording, poses), indices=posed)
-            config_used = replace(given_config, refinement=config.refinement)
-        return reconstructing.reconstruct(source, config_used, threads=threads, progress=progress)
-
+    reasons = verdicts.ranked([*found])
+    source = recording
+    if refined.started:
+        # Frames to which no pose was given are not lost.
+        posed = recording.indices[np.isfinite(poses).all((1, 2))]
+        source = replace(adaptation.with_odometry(recording, poses), indices=posed)
+        config = replace(given_config, refinement=config.refinement)
     return Judgement(
         poses,
         accuracy,
@@ -291,7 +274,26 @@ def judge(
         estimate,
         cause,
         refined.finding,
-        _reconstruct=reconstruct,
+        _reconstruct=partial(
+            reconstructing.reconstruct, source, config, threads=threads, progress=progress
+        ),
+    )
+
+
+def _config(recording: Recording, tolerance_m: float | None) -> Config:
+    """Return the configuration that judges the poses of a recording's images.
+
+    External sensors do not measure these poses, and images are compared with the stated camera.
+    """
+    kind = reconstructing.view_kind(recording)
+    if kind == "cloud":
+        raise InputError(
+            "contains clouds, and poses are judged by depth images",
+            where=recording.path,
+            remedy="compare the poses with a reference: tofuse evaluate",
+        )
+    return replace(
+        from_method("default", kind), tolerance_m=tolerance_m, priors=(), self_calibration=False
     )
 
 
