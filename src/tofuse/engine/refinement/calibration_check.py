@@ -303,13 +303,21 @@ class _Estimate:
     def likely(self) -> list[str]:
         """Names of models that are about as likely as the likeliest, which comes first.
 
-        Without strong evidence for another one, all errors are usual.
+        Without strong evidence for another one, all errors are usual. An error that the views don't
+        determine is no explanation.
         """
         evidence = {name: model.evidence for name, model in self.models.items()}
         least = max(evidence.values()) - _STRONG
         if evidence[""] > least:
             return [""]
-        return sorted((n for n, e in evidence.items() if e > least), key=lambda n: -evidence[n])
+        best = max(evidence, key=lambda name: evidence[name])
+        others = (n for n, e in evidence.items() if e > least and n != best)
+        return [best, *filter(self._determines, others)]
+
+    def _determines(self, name: str) -> bool:
+        """Whether the views determine an error that is not usual."""
+        k = list(_INDEX).index(name)
+        return bool(self.models[name].covariance[k, k] < _DETERMINED * _UNUSUAL**2)
 
     @property
     def found(self) -> Posterior:
