@@ -1,19 +1,21 @@
 """Depth errors that are fixed to the camera: whole runs with and without their estimate.
 
-Recordings of the second simulator (`other_sensor.py`), without indirect light, and with a smooth
-pattern of errors over the image that is added to all depths. Each is reconstructed as by default,
-and without `refinement.fixed_pattern`. A row has the rms of the pattern, and, without and with the
-estimate, the rms error of the poses and the stated bound; at the end, by rms, the median ratio of
-the errors, and how many are within their bound.
+Recordings of the second simulator (`other_sensor.py`), without indirect light, and with errors that
+are added to all depths: a smooth pattern over the image, or a periodic error of the range. Each is
+reconstructed as by default, and without `refinement.fixed_pattern`. A row has the rms of these
+errors, and, without and with the estimate, the rms error of the poses and the stated bound; at the
+end, by rms, the median ratio of the errors, and how many are within their bound.
 
     python benchmarks/fixed_pattern.py [--seeds 61] [--cameras azure phone] [--rms 0 2 4]
+        [--periodic 2 4]
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from unittest.mock import patch
 
 import cv2
@@ -21,14 +23,16 @@ import numpy as np
 
 import other_sensor
 from tofuse.engine.arrays import Float32
+from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.refinement import fixed_pattern
 
-Row = tuple[str, float, tuple[float, float], tuple[float, float]]
+Row = tuple[str, str, tuple[float, float], tuple[float, float]]
 WIDTH = 0.1  # of the kernel that makes the pattern smooth, as a fraction of the image's width
+PERIOD_M = 1.2  # of the periodic error
 
 
 def pattern(shape: tuple[int, int], rms_m: float, rng: np.random.Generator) -> Float32:
@@ -40,10 +44,19 @@ def pattern(shape: tuple[int, int], rms_m: float, rng: np.random.Generator) -> F
     return (rms_m * smooth / smooth.std()).astype(np.float32)
 
 
-def with_pattern(recording: Recording, errors: Float32) -> Recording:
+def periodic(frame: RangeFrame, rms_m: float) -> Float32:
+    """Return a periodic error of the range (H, W), as a change of the depth, m."""
+    lengths = ray_lengths(frame.camera)
+    wave = 2**0.5 * rms_m * np.sin(2 * np.pi * frame.depth * lengths / PERIOD_M)
+    return (wave / lengths).astype(np.float32)
+
+
+def with_errors(recording: Recording, errors: Callable[[RangeFrame], Float32]) -> Recording:
     """Return a recording whose depth has these errors, m."""
     frames = [
-        replace(frame, depth=np.where(frame.valid, frame.depth + errors, 0).astype(np.float32))
+        replace(
+            frame, depth=np.where(frame.valid, frame.depth + errors(frame), 0).astype(np.float32)
+        )
         for frame in recording
         if isinstance(frame, RangeFrame)
     ]
@@ -60,20 +73,32 @@ def judged(recording: Recording) -> tuple[float, float]:
     return 1e3 * error, 1e3 * result.diagnostics.accuracy.position_m
 
 
-def rows(seeds: Sequence[int], cameras: Sequence[str], rms: Sequence[float]) -> Iterator[Row]:
-    """Yield for each recording its name, the rms, and both errors and bounds."""
+def errors_of(
+    rms: Sequence[float], along: Sequence[float], shape: tuple[int, int], seed: int
+) -> Iterator[tuple[str, Callable[[RangeFrame], Float32]]]:
+    """Yield errors by name, with rms over the image or along the range, mm."""
+    for size in rms:
+        over_image = pattern(shape, 1e-3 * size, np.random.default_rng(seed))
+        yield f"{size:g}, image", lambda _, errors=over_image: errors
+    for size in along:
+        yield f"{size:g}, range", partial(periodic, rms_m=1e-3 * size)
+
+
+def rows(
+    seeds: Sequence[int], cameras: Sequence[str], rms: Sequence[float], along: Sequence[float]
+) -> Iterator[Row]:
+    """Yield for each recording its name, its errors, and both errors of the poses and bounds."""
     for seed in seeds:
         for camera in cameras:
             for scene in other_sensor.SCENES:
                 plain = other_sensor.record(scene, camera, seed, indirect=False)
                 shape = plain[0].depth.shape
-                for size in rms:
-                    errors = pattern(shape, 1e-3 * size, np.random.default_rng(seed))
-                    recording = with_pattern(plain, errors)
+                for name, errors in errors_of(rms, along, shape, seed):
+                    recording = with_errors(plain, errors)
                     nothing = fixed_pattern.FixedPattern(None)
                     with patch.object(fixed_pattern, "estimate", return_value=nothing):
                         without = judged(recording)
-                    yield f"{scene}, {camera}, seed {seed}", size, without, judged(recording)
+                    yield f"{scene}, {camera}, seed {seed}", name, without, judged(recording)
 
 
 def main() -> None:
@@ -85,26 +110,27 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="*", type=int, default=[61])
     parser.add_argument("--cameras", nargs="*", default=["azure", "phone"], choices=cameras)
     parser.add_argument("--rms", nargs="*", type=float, default=[0, 2, 4], help="mm")
+    parser.add_argument("--periodic", nargs="*", type=float, default=[2, 4], help="mm")
     given = parser.parse_args()
-    print("| recording | pattern, mm | error, mm: without, with | bound, mm |")
+    print("| recording | errors, mm | error, mm: without, with | bound, mm |")
     print("|---" * 4 + "|")
     found = []
-    for row in rows(given.seeds, given.cameras, given.rms):
-        name, size, without, estimated = row
+    for row in rows(given.seeds, given.cameras, given.rms, given.periodic):
+        name, errors, without, estimated = row
         found.append(row)
         print(
-            f"| {name} | {size:g} | {without[0]:.1f}, {estimated[0]:.1f} "
+            f"| {name} | {errors} | {without[0]:.1f}, {estimated[0]:.1f} "
             f"| {without[1]:.1f}, {estimated[1]:.1f} |",
             flush=True,
         )
-    print("\n| pattern, mm | runs | error with / without | better | within the bound |")
+    print("\n| errors, mm | runs | error with / without | better | within the bound |")
     print("|---" * 5 + "|")
-    for size in given.rms:
-        own = [row for row in found if row[1] == size]
+    for errors in dict.fromkeys(row[1] for row in found):
+        own = [row for row in found if row[1] == errors]
         ratios = np.array([estimated[0] / without[0] for _, _, without, estimated in own])
         inside = [sum(run[k][0] <= run[k][1] for run in own) for k in (2, 3)]
         print(
-            f"| {size:g} | {len(own)} | {np.median(ratios):.2f} | {(ratios < 1).sum()} "
+            f"| {errors} | {len(own)} | {np.median(ratios):.2f} | {(ratios < 1).sum()} "
             f"| {inside[0]}, {inside[1]} |"
         )
 

@@ -406,12 +406,28 @@ def test_an_error_of_the_focal_length_moves_rays_by_the_slope_of_the_distortion(
     np.testing.assert_allclose(landed[-1], [81, 65], atol=0.05)
 
 
-def test_depth_errors_that_are_fixed_to_the_camera_are_removed_from_the_surface() -> None:
-    wave = 0.01 * np.sin(np.linspace(0, 2 * np.pi, 88))[None] * np.ones((72, 1))
+RANGES = plane_range(EYE, np.array([0, 0, 1.0]), 2.0)
+WAVE = 0.01 * np.sin(np.linspace(0, 2 * np.pi, 88))[None] * np.ones((72, 1))
+ALONG = (0.015 * np.sin(4 * np.pi * np.linspace(0, 3, 900))).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("errors", "pattern"),
+    [
+        (WAVE, FixedPattern(WAVE[::2, ::2].astype(np.float32))),
+        (
+            0.015 * np.sin(4 * np.pi * RANGES),
+            FixedPattern(np.zeros((36, 44), np.float32), profile=ALONG, reach=3.0),
+        ),
+    ],
+    ids=["image", "range"],
+)
+def test_depth_errors_that_are_fixed_to_the_camera_are_removed_from_the_surface(
+    errors, pattern
+) -> None:
     builder = ModelBuilder(Fusion())
-    builder.add(frame_of(plane_range(EYE, np.array([0, 0, 1.0]), 2.0) - wave), None, 1000)
+    builder.add(frame_of(RANGES - errors), None, 1000)
     with_errors = builder.fuse({0: EYE}).mesh.vertices[:, 2]
-    pattern = FixedPattern(wave[::2, ::2].astype(np.float32))
     without = builder.fuse({0: EYE}, pattern=pattern).mesh.vertices[:, 2]
     assert with_errors.std() > 0.005
     assert without.std() < 0.2 * with_errors.std()

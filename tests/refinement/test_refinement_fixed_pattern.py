@@ -23,6 +23,9 @@ PATTERN = 0.004 * np.cos(2 * ACROSS) * np.cos(DOWN) - 0.003 * np.cos(3 * ACROSS)
 """Errors of the depth, m."""
 NOISE = 0.002
 """Noise of the depth, m."""
+X, Y = (U - 0.5 - CAMERA.cx) / CAMERA.fx, (V - 0.5 - CAMERA.cy) / CAMERA.fy
+LENGTHS = np.sqrt(1 + X**2 + Y**2).astype(np.float32)
+"""Of the rays at depth 1."""
 
 
 def views(poses, errors, noise: float = NOISE) -> list[SampledView]:
@@ -92,9 +95,39 @@ def test_errors_of_triangulation_grow_with_the_squared_depth():
 
     small = found(0.4)
     assert small.power == 2
-    at_depth = small.at(np.full(PATTERN.shape, depth, np.float32), small.z)
+    at_depth = small.at(np.full(PATTERN.shape, depth, np.float32), small.z, LENGTHS)
     assert np.corrcoef(at_depth.ravel(), -PATTERN.ravel())[0, 1] > 0.8
     assert found(2.0).z is None  # far above the noise
+
+
+def test_periodic_error_of_the_range_is_found_from_poses_that_followed_it():
+    """As of a time-of-flight camera: that of the image alone explains nothing of it."""
+    truth = path(24)
+    ranges = [corner(T).depth * LENGTHS for T in truth]
+    seen = views(truth, [0.003 * np.sin(2 * np.pi * r / 1.2) / LENGTHS for r in ranges])
+    chain = np.stack([np.arange(23), np.arange(1, 24)], 1)
+    bent = refine(seen, truth, replace(OPTIONS, shared=0.0), pairs=chain).poses
+    found = fixed_pattern.estimate(seen, bent, OPTIONS)
+    assert found.power == 0
+    assert found.z.std() < 0.0003
+    at = (np.arange(len(found.profile)) + 0.5) / len(found.profile) * found.reach
+    within = at > np.quantile(ranges, 0.05)
+    # But for a constant and a scale, which no view shows.
+    line = np.column_stack([np.ones(len(at)), at])[within]
+    wave = -0.003 * np.sin(2 * np.pi * at[within] / 1.2)
+    left = found.profile[within] - wave
+    left -= line @ np.linalg.lstsq(line, left, rcond=None)[0]
+    assert left.std() < 0.3 * wave.std()
+    as_they_are = refine(seen, bent, OPTIONS).poses
+    without = refine([found.corrected(view) for view in seen], bent, OPTIONS).poses
+    assert away(without, truth) < 0.5 * away(as_they_are, truth)
+
+
+def test_errors_along_the_range_beyond_those_of_cameras_are_left():
+    truth = path(24)
+    ranges = [corner(T).depth * LENGTHS for T in truth]
+    seen = views(truth, [0.015 * np.sin(2 * np.pi * r / 1.2) / LENGTHS for r in ranges])
+    assert not fixed_pattern.estimate(seen, truth, OPTIONS).profile.any()
 
 
 def test_runs_of_many_views_suffice():
@@ -119,9 +152,23 @@ def test_nothing_is_found_where_errors_differ_from_view_to_view():
     assert found.z is None or found.z.std() < 0.2 * turning.std()
 
 
-def test_corrected_view_is_that_of_a_camera_without_errors():
-    (wrong,), (right,) = (views(np.eye(4)[None], e, noise=0.0) for e in (PATTERN, 0.0))
-    pattern = fixed_pattern.FixedPattern((-PATTERN).astype(np.float32))
+OF_RANGE = 0.004 * np.sin(np.pi * corner(np.eye(4)).depth * LENGTHS)
+PROFILE = -0.004 * np.sin(4 * np.pi * (np.arange(2000) + 0.5) / 2000)
+
+
+@pytest.mark.parametrize(
+    ("errors", "pattern"),
+    [
+        (PATTERN, fixed_pattern.FixedPattern((-PATTERN).astype(np.float32))),
+        (
+            OF_RANGE / LENGTHS,
+            fixed_pattern.FixedPattern(np.zeros_like(LENGTHS), PROFILE.astype(np.float32), 4.0),
+        ),
+    ],
+    ids=["image", "range"],
+)
+def test_corrected_view_is_that_of_a_camera_without_errors(errors, pattern):
+    (wrong,), (right,) = (views(np.eye(4)[None], e, noise=0.0) for e in (errors, 0.0))
     corrected = pattern.corrected(wrong)
     np.testing.assert_allclose(corrected.points[:, :3], right.points[:, :3], atol=2e-4)
     depth_right, *depths = (depth_of_planes(view) for view in (right, wrong, corrected))

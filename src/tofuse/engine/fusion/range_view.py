@@ -251,7 +251,8 @@ class CameraCorrection:
             if shape not in self._patterns:
                 resized = cv2.resize(self._pattern.z, shape[::-1])
                 self._patterns[shape] = np.asarray(resized, np.float32)
-            z += np.where(z > 0, self._pattern.at(z, self._patterns[shape]), 0)
+            lengths = np.sqrt(projection.lengths2)
+            z += np.where(z > 0, self._pattern.at(z, self._patterns[shape], lengths), 0)
         z = z * np.float32(1 + errors.get("scale", 0.0)) + np.where(
             z > 0, np.float32(errors.get("offset", 0.0)) / np.sqrt(projection.lengths2), 0
         )

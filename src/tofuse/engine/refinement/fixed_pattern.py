@@ -1,13 +1,14 @@
-"""Depth errors that are fixed to the camera: a pattern over the image, estimated from all views.
+"""Depth errors that are fixed to the camera, over the image and the range, from all views.
 
 A depth camera has errors of millimetres that vary smoothly over the image: remainders of its
-calibration, of the lens and of the maker's filters. They move with the camera, so that neighbouring
-views fit best where the path is bent, and no residual shows it. But a surface that moves through
-the image meets different errors. From this the pattern is estimated, as Teichman, Miller and Thrun
-do from a map (Unsupervised intrinsic calibration of depth sensors via SLAM, 2013), here with the
-relative pose of each pair of views free.
+calibration, of the lens and of the maker's filters. And the range of a time-of-flight camera has a
+periodic error, as its light is no pure sine (Lindner and Kolb 2006). They move with the camera, so
+that neighbouring views fit best where the path is bent, and no residual shows it. But a surface
+that moves through the image, or comes nearer, meets different errors. From this they are estimated,
+as Teichman, Miller and Thrun do from a map (Unsupervised intrinsic calibration of depth sensors via
+SLAM, 2013), here with the relative pose of each pair of views free.
 
-The pattern is a sum of cosines, whose coefficients have one variance, which the views tell as well
+Both are sums of cosines, whose coefficients have one variance each, which the views tell as well
 (empirical Bayes): where there is no pattern, it vanishes. Other errors, such as multipath, differ
 from view to view, and their scatter divides the information.
 
@@ -18,7 +19,7 @@ are left alone: they reach centimetres, and the recorded images would no longer 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -36,10 +37,14 @@ from tofuse.engine.views import residual_kernels
 # Half periods of the cosines across and down; without the constant, the range offset of the camera.
 _ACROSS, _DOWN = 7, 6
 _ORDERS = np.array([(a, b) for a in range(_ACROSS) for b in range(_DOWN) if a or b])
-_MODES = len(_ORDERS)
+# Largest number of cosines along the range, between these quantiles of all; and their longest and
+# shortest period, m: of the fourth harmonic of light that is modulated at 20 and at 200 MHz.
+# Multipath changes more smoothly.
+_ALONG, _WITHIN, _LONGEST, _SHORTEST = 16, (0.01, 0.99), 1.9, 0.19
+# Ranges at which their sum is stored, and from which they are chosen.
+_TABLE, _MAX_RANGES = 1024, 20_000
 # Errors of the calibration, which are estimated as well.
 _ERRORS = "focal", "center_x", "center_y", "distortion", "offset"
-_UNKNOWNS = _MODES + len(_ERRORS)
 # The errors of time of flight are the same at each depth, those of triangulation, in the disparity,
 # grow with its square, and so do some of multipath: powers that are tried.
 _POWERS = 0.0, 2.0
@@ -60,7 +65,6 @@ _PRIOR = np.array([1 / _POSE_SIGMA**2] * 6 + [1.0])
 _STRONG = float(np.log(10))
 # Iterations for the variance of the coefficients, from this sigma, m.
 _ITERATIONS, _FIRST_SIGMA = 20, 0.002
-_ZERO = np.zeros(_UNKNOWNS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,12 +75,17 @@ class FixedPattern:
     ----------
     z
         (H, W) m, along the ray, at `depth`, with a mean of about 0; None without strong evidence
-        for any.
+        for any error.
+    profile, reach
+        (TABLE,) m, what is to be added to the range at ranges from 0 to `reach`, m. But for a
+        constant and a scale, which are errors of the calibration.
     depth, power
-        m, and power of the depth relative to this, to which the errors are proportional.
+        m, and power of the depth relative to this, to which both are proportional.
     """
 
     z: Float32 | None
+    profile: Float32 = field(default_factory=lambda: np.zeros(_TABLE, np.float32))
+    reach: float = 1.0
     depth: float = 1.0
     power: float = 0.0
 
@@ -86,17 +95,26 @@ class FixedPattern:
             return view
         points, target = view.points.copy(), view.target.copy()
         z = points[:, 2]
-        points[:, :3] *= (1 + self.at(z, self.z.ravel()[_pixels(view)]) / z)[:, None]
-        along = (target[..., :2] * view.projection.rays).sum(-1) + target[..., 2]
+        change = self.at(z, self.z.ravel()[_pixels(view)], _lengths(points))
+        points[:, :3] *= (1 + change / z)[:, None]
+        rays = view.projection.rays
+        along = (target[..., :2] * rays).sum(-1) + target[..., 2]
         distance = target[..., residual_kernels.DISTANCE]
         scale = np.float32(view.target_scale)
         of_planes = np.divide(distance * scale, along, out=np.zeros_like(along), where=along != 0)
-        distance += np.where(distance != 0, along * self.at(of_planes, self.z) / scale, 0)
+        change = self.at(of_planes, self.z, np.sqrt(1 + (rays**2).sum(-1)))
+        distance += np.where(distance != 0, along * change / scale, 0)
         return replace(view, points=points, target=target)
 
-    def at(self, z: Float32, pattern: Float32) -> Float32:
-        """Return what is to be added at depths z, m, to pixels with these values of the pattern."""
-        return np.asarray(pattern * (z / np.float32(self.depth)) ** np.float32(self.power))
+    def at(self, z: Float32, pattern: Float32, lengths: Float32) -> Float32:
+        """Return what is to be added at depths z, m, to pixels with these values of the pattern.
+
+        `lengths` are those of their rays at depth 1.
+        """
+        entries = z * lengths * np.float32(len(self.profile) / self.reach)
+        entry = np.nan_to_num(entries).clip(0, len(self.profile) - 1).astype(np.intp)
+        factor = (z / np.float32(self.depth)) ** np.float32(self.power)
+        return np.asarray((pattern + self.profile[entry] / lengths) * factor, np.float32)
 
 
 NONE = FixedPattern(None)
@@ -108,6 +126,11 @@ def _pixels(view: SampledView) -> Intp:
     points = view.points.astype(np.float64)
     u, v = np.rint(view.projection.pixels(points[:, :2] / points[:, 2:3])).T
     return (v.clip(0, rows - 1) * columns + u.clip(0, columns - 1)).astype(np.intp)
+
+
+def _lengths(points: Float32) -> Float32:
+    """Return the lengths (N,) of the rays of points (N, 3 or more) at depth 1."""
+    return np.asarray(np.linalg.norm(points[:, :3], axis=1) / points[:, 2], np.float32)
 
 
 def runs(count: int) -> Intp:
@@ -143,28 +166,86 @@ def estimate(
         return NONE
     depth = float(np.median([view.depth for view in views]))
     cosines = _cosines(shape)
-
-    # Half of the pairs tell which power is likelier.
-    tried = [_Modes(cosines, depth, power) for power in _POWERS]
-    first = [_fitted(compared[::2], modes, _ZERO, _INFLATIONS[0]) for modes in tried]
-    modes, fit = max(zip(tried, first, strict=True), key=lambda item: item[1].log_ratio)
-    for inflation in _INFLATIONS[1:]:
-        fit = _fitted(compared, modes, fit.coefficients, inflation)
-    errors = zip(_ERRORS, fit.coefficients[_MODES:], strict=True)
+    ranges = np.concatenate([np.linalg.norm(view.points[:, :3], axis=1) for view in views])
+    ranges = ranges[:: -(-len(ranges) // _MAX_RANGES)]
+    modes, fit = _likeliest(compared, cosines, depth, ranges)
     # A wrong calibration is to be corrected first: the pattern would take some of its effects.
-    if fit.log_ratio < _STRONG or any(abs(error) > TOLERANCES[name] for name, error in errors):
+    if fit.log_ratio < _STRONG or not fit.is_calibrated:
         return NONE
-    z = (cosines @ fit.coefficients[:_MODES]).astype(np.float32).reshape(shape)
+    z = modes.over_image(fit.coefficients).reshape(shape)
     if modes.power and z.std() > np.median([view.sigma for view in views]):
         return NONE
-    return FixedPattern(z, depth, modes.power)
+    if modes.periods is None:
+        return FixedPattern(z, depth=depth, power=modes.power)
+    _, reach = modes.periods.within
+    centres = ((np.arange(_TABLE) + 0.5) * reach / _TABLE).astype(np.float32)
+    return FixedPattern(z, modes.along(centres, fit.coefficients), reach, depth, modes.power)
+
+
+def _likeliest(
+    compared: Sequence[_Compared], cosines: Float32, depth: float, ranges: Float32
+) -> tuple[_Modes, _Fit]:
+    """Return the likeliest modes, over the image alone or also along ranges (N,), and their fit."""
+    # Half of the pairs tell which power is likelier.
+    tried = [_Modes(cosines, depth, power) for power in _POWERS]
+    first = [_fitted(compared[::2], modes, modes.zero, _INFLATIONS[0]) for modes in tried]
+    modes, fit = max(zip(tried, first, strict=True), key=lambda item: item[1].log_ratio)
+    periodic = _Modes(cosines, depth, periods=_Periods.of(ranges))
+    of_range = _of_range(compared, periodic, least=fit.log_ratio + _STRONG)
+    for inflation in _INFLATIONS[1:]:
+        fit = _fitted(compared, modes, fit.coefficients, inflation)
+    if of_range is not None and of_range.log_ratio > fit.log_ratio + _STRONG:
+        # Along the range, a larger pattern over the image leaves something, too.
+        along = periodic.along(ranges, of_range.coefficients)
+        if along.std() > periodic.over_image(of_range.coefficients).std():
+            modes, fit = periodic, of_range
+    return modes, fit
 
 
 def _cosines(shape: tuple[int, ...]) -> Float32:
-    """Return the modes (H W, MODES) of an image (H, W)."""
+    """Return the modes (H W, ORDERS) of an image (H, W)."""
     v, u = np.indices(shape).reshape(2, -1)
     phase = np.pi * (np.stack([u, v], 1) + 0.5) / shape[::-1]
     return np.prod(np.cos(phase[:, None] * _ORDERS), axis=2).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class _Periods:
+    """Cosines along the range.
+
+    Attributes
+    ----------
+    ranges, within
+        (N,) that points have, and the lowest and the highest of those with different errors, m.
+    half_periods
+        (K,) up to the highest.
+    lines
+        (2, K) constant and slope that are subtracted from the cosines.
+    """
+
+    ranges: Float32
+    within: tuple[float, float]
+    half_periods: Float32
+    lines: Float32
+
+    @classmethod
+    def of(cls, ranges: Float32) -> _Periods:
+        """Choose those of points with ranges (N,), m."""
+        low, high = np.quantile(ranges, _WITHIN).tolist()
+        longest = np.clip(high - low, 1e-3, _LONGEST)
+        least, most = 2 * high / longest, 2 * high / _SHORTEST
+        count = np.arange(np.ceil(least), most + 1, dtype=np.float32)[:_ALONG]
+        periods = cls(ranges, (low, high), count, np.zeros((2, len(count)), np.float32))
+        line = np.column_stack([np.ones_like(ranges), ranges])
+        lines = np.linalg.lstsq(line, periods.at(ranges), rcond=None)[0]
+        return replace(periods, lines=lines.astype(np.float32))
+
+    def at(self, ranges: Float32) -> Float32:
+        """Return them (N, K) at ranges (N,), m."""
+        ranges = np.asarray(np.clip(ranges, *self.within), np.float32)
+        phase = np.float32(np.pi / self.within[1]) * ranges
+        line = self.lines[0] + self.lines[1] * ranges[:, None]
+        return np.asarray(np.cos(phase[:, None] * self.half_periods) - line, np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,14 +255,44 @@ class _Modes:
     Attributes
     ----------
     cosines
-        (H W, MODES).
+        (H W, ORDERS) over the image.
     depth, power
         m, and power of the depth relative to this, to which the changes are proportional.
+    periods
+        Those along the range, if there are any.
     """
 
     cosines: Float32
     depth: float
-    power: float
+    power: float = 0.0
+    periods: _Periods | None = None
+
+    @property
+    def groups(self) -> tuple[slice, ...]:
+        """Which modes are over the image, and which along the range."""
+        of_image = self.cosines.shape[1]
+        if self.periods is None:
+            return (slice(0, of_image),)
+        return slice(0, of_image), slice(of_image, of_image + len(self.periods.half_periods))
+
+    @property
+    def count(self) -> int:
+        """Number of modes."""
+        return int(self.groups[-1].stop)
+
+    @property
+    def zero(self) -> Float64:
+        """Coefficients of the modes, and errors, that are 0 (UNKNOWNS,)."""
+        return np.zeros(self.count + len(_ERRORS))
+
+    def over_image(self, coefficients: Float64) -> Float32:
+        """Return the sum (H W,) of those over the image, m."""
+        return (self.cosines @ coefficients[self.groups[0]]).astype(np.float32)
+
+    def along(self, ranges: Float32, coefficients: Float64) -> Float32:
+        """Return the sum (N,) of those along the range at ranges (N,), m."""
+        assert self.periods is not None, "there are such modes"
+        return (self.periods.at(ranges) @ coefficients[self.groups[1]]).astype(np.float32)
 
 
 def _pairs(positions: Intp) -> Intp:
@@ -201,20 +312,25 @@ class _Rays:
 
     Attributes
     ----------
-    pixels, z
-        (N,) of the rays, and depth of the points on them, m.
+    pixels, points
+        (N,) of the rays, and (N, 3) points on them, m.
     per_z
-        (N,) change of the residual with this depth.
+        (N,) change of the residual with their depth.
     """
 
     pixels: Intp
-    z: Float32
+    points: Float32
     per_z: Float32
 
     def by(self, modes: _Modes) -> Float32:
         """Return the changes of the residuals by the coefficients of the modes, (N, MODES)."""
-        factor = self.per_z * (self.z / np.float32(modes.depth)) ** np.float32(modes.power)
-        return np.asarray(modes.cosines[self.pixels] * factor[:, None], np.float32)
+        z, lengths = self.points[:, 2], _lengths(self.points)
+        factor = self.per_z * (z / np.float32(modes.depth)) ** np.float32(modes.power)
+        columns = modes.cosines[self.pixels]
+        if modes.periods is not None:
+            along = modes.periods.at(z * lengths) / lengths[:, None]
+            columns = np.concatenate([columns, along], axis=1)
+        return np.asarray(columns * factor[:, None], np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -349,11 +465,11 @@ def _terms(
         by_pose = np.column_stack([m, np.cross(p, m), np.full(len(p), exposure, np.float32)])
         of_source, by_errors = _by_camera(m, p, radial=source.measures_range)
         of_target, errors = _by_camera(n, q_, radial=target.measures_range)
-        rays = [_Rays(pixels[which], p[:, 2], of_source)]
+        rays = [_Rays(pixels[which], p, of_source)]
         if exposure:
             errors[:, -1] = 0.0
         else:
-            rays.append(_Rays(pixel[which], q_[:, 2], of_target))
+            rays.append(_Rays(pixel[which], q_, of_target))
         return _Differences(r[which], by_pose, by_errors - errors, tuple(rays))
 
     distances = term(seen, (n * q).sum(1) - distance, n, 0.0)
@@ -396,13 +512,38 @@ class _Fit:
     coefficients: Float64
     log_ratio: float
 
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether no error exceeds the tolerance."""
+        errors = zip(_ERRORS, self.coefficients[-len(_ERRORS) :], strict=True)
+        return all(abs(error) <= TOLERANCES[name] for name, error in errors)
+
+
+def _of_range(compared: Sequence[_Compared], modes: _Modes, least: float) -> _Fit | None:
+    """Fit errors along the range as well; None if the views are not likelier than `least`.
+
+    Or if these, or errors of the calibration beside them, exceed those of usual cameras: they then
+    show something else, such as multipath, or are not told from these.
+    """
+    assert modes.periods is not None, "there are such modes"
+    coefficients, some = modes.zero, compared[::2]
+    if not len(modes.periods.half_periods):
+        return None
+    for inflation in _INFLATIONS:
+        fit = _fitted(some, modes, coefficients, inflation)
+        coefficients, some = fit.coefficients, compared
+        too_large = modes.along(modes.periods.ranges, coefficients).std() > USUAL
+        if too_large or not fit.is_calibrated or fit.log_ratio < least:
+            return None
+    return fit
+
 
 def _fitted(
     compared: Sequence[_Compared], modes: _Modes, coefficients: Float64, inflation: float
 ) -> _Fit:
     """Fit coefficients with the robust weights at the last ones.
 
-    Their variance maximises the likelihood (expectation maximisation). The information is divided
+    Their variances maximise the likelihood (expectation maximisation). The information is divided
     by the scatter of the scores of sections of the path, by the targets of the pairs, relative to
     that by noise alone: within a section, views share the errors of the scene.
     """
@@ -416,18 +557,19 @@ def _fitted(
     target = np.array([pair.target for pair in compared])
     total, gradient = A.sum(0), g.sum(0)
     section = target * SECTIONS // (int(target.max()) + 1)
-    pattern = np.arange(_MODES)
-    c, variance, dispersion = np.zeros(_UNKNOWNS), _FIRST_SIGMA**2, 1.0
+    count, usual = modes.count, np.full(len(_ERRORS), USUAL**2)
+    c, dispersion = np.zeros(len(total)), 1.0
+    prior = np.append(np.full(count, _FIRST_SIGMA**2), usual)
     for _ in range(_ITERATIONS):
-        prior = np.append(np.full(_MODES, variance), np.full(len(_ERRORS), USUAL**2))
         covariance = np.linalg.inv(total / dispersion + np.diag(1 / prior))
         c = -covariance @ gradient / dispersion
-        variance = float(c[pattern] @ c[pattern] + np.trace(covariance[:_MODES, :_MODES])) / _MODES
-        scores = np.zeros((SECTIONS, _MODES))
-        np.add.at(scores, section, (g + A @ c)[:, pattern])
+        for group in modes.groups:
+            prior[group] = np.mean(c[group] ** 2 + np.diag(covariance)[group])
+        scores = np.zeros((SECTIONS, count))
+        np.add.at(scores, section, (g + A @ c)[:, :count])
         scatter = float(scores.var(0, ddof=1).sum()) * SECTIONS
-        dispersion = max(scatter / float(np.trace(total[:_MODES, :_MODES])), 1.0)
-    without = np.append(np.zeros(_MODES), np.full(len(_ERRORS), USUAL**2))
+        dispersion = max(scatter / float(np.trace(total[:count, :count])), 1.0)
+    without = np.append(np.zeros(count), usual)
     with_pattern, none = (
         _log_evidence(total / dispersion, gradient / dispersion, p) for p in (prior, without)
     )
