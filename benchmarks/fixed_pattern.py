@@ -45,8 +45,10 @@ def pattern(shape: tuple[int, int], rms_m: float, rng: np.random.Generator) -> F
 
 
 def periodic(frame: RangeFrame, rms_m: float) -> Float32:
-    """Return a periodic error of the range (H, W), as a change of the depth, m."""
-    lengths = ray_lengths(frame.camera)
+    """Return a periodic error of the range (H, W), as a change of the image's depth, m."""
+    lengths = (
+        np.ones_like(frame.depth) if frame.depth_kind == "range" else ray_lengths(frame.camera)
+    )
     wave = 2**0.5 * rms_m * np.sin(2 * np.pi * frame.depth * lengths / PERIOD_M)
     return (wave / lengths).astype(np.float32)
 
