@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -81,7 +82,7 @@ def test_covariances_cover_errors_as_normal_ones_would(degrees, factor) -> None:
     assert 0.94 < np.mean(squares < 12.59) < 0.96
 
 
-def bound_of(*errors: float, **named: float) -> Accuracy:
+def bound_of(*errors: float, **named: Any) -> Accuracy:
     return accuracy_of(GraphCovariances(walk()), ObservedErrors(*errors, **named), 1.0)
 
 
@@ -94,7 +95,7 @@ def test_scaled_registrations_include_errors_of_the_camera():
 
 
 def test_scaled_covariance_leaves_other_causes():
-    observed = ObservedErrors(0.03, 0.02, 0.04, 0.05, 0.06, 0.07, 0.08)
+    observed = ObservedErrors(0.03, 0.02, 0.04, 0.05, 0.06, (0.07, 0.08), 0.09)
     by_odometry = observed.of_other_sensors().mean_squares(np.array([1e-4, 1e-5]))
     np.testing.assert_array_equal(by_odometry["noise"], [1e-4, 1e-5])
     assert not by_odometry["calibration"].any()
@@ -164,23 +165,26 @@ def noise_m() -> float:
 
 def test_halves_of_images_measure_errors_of_this_camera() -> None:
     plain, noise = bound_of(), noise_m()
-    same, twice, four, less = (bound_of(split_m=k * noise) for k in (1, 2, 4, 0.1))
+    same, twice, four, less, none = (bound_of(split=(k * noise, 0.0)) for k in (1, 2, 4, 0.1, 0))
     assert same.position_m < 0.85 * plain.position_m  # known better
     assert twice.position_m == pytest.approx(2 * same.position_m)
     assert four.position_m == pytest.approx(4 * same.position_m)
-    assert four.rotation_rad == plain.rotation_rad
+    assert four.rotation_rad == same.rotation_rad < plain.rotation_rad
     # They may also miss errors: smaller ones count as half of the evidence.
     assert less.position_m == pytest.approx(same.position_m * np.sqrt(0.505))
-    assert bound_of(split_m=0.0) == plain  # nothing was measured
+    assert none.position_m == pytest.approx(same.position_m * np.sqrt(0.5))
+    assert bound_of(split=None) == plain  # nothing was measured
     # Halves share the error of a correction that was estimated from both.
-    assert bound_of(split_m=noise, corrected=True).position_m == pytest.approx(plain.position_m)
+    assert bound_of(split=(noise, 0.0), corrected=True).position_m == pytest.approx(
+        plain.position_m
+    )
     C_plain, C_same, C_more, C_less = (
-        covariances_of(GraphCovariances(walk()), ObservedErrors(split_m=k * noise))[5]
-        for k in (0, 1, 3, 0.1)
+        covariances_of(GraphCovariances(walk()), ObservedErrors(split=split))[5]
+        for split in (None, *((k * noise, 0.0) for k in (1, 3, 0.1)))
     )
     assert np.trace(C_same[:3, :3]) < np.trace(C_plain[:3, :3])
     np.testing.assert_allclose(C_more[:3, :3], 9 * C_same[:3, :3])
-    np.testing.assert_array_equal(C_more[3:, 3:], C_plain[3:, 3:])
+    np.testing.assert_array_equal(C_more[3:, 3:], C_same[3:, 3:])
     np.testing.assert_allclose(C_less, C_same)
 
 

@@ -311,12 +311,12 @@ class Assessment:
         calibration = 0.0, 0.0
         if refinement.calibration_check is not None:
             calibration = camera_uncertainty.pose_errors(refinement.calibration_check, corrections)
-        split = refinement.split_m, refinement.split_rad
+        split = (refinement.split_m, refinement.split_rad) if refinement.kept else None
         depth_m = float(np.median(self._depths)) if self._depths else 0.0
         positions = refined.graph.poses[:, :3, 3]
         range_m = pose_accuracy.error_by_range(positions, refinement.shared_rms, depth_m)
         return pose_accuracy.ObservedErrors(
-            *moved, excess_m, *calibration, *split, range_m, corrected=bool(corrections)
+            *moved, excess_m, *calibration, split, range_m, corrected=bool(corrections)
         )
 
     def _measured(self, graph: PoseGraph, refinement: Refinement) -> PoseGraph:

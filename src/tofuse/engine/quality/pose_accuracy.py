@@ -149,8 +149,9 @@ class ObservedErrors:
         Rms by which views far apart in time disagree, beyond consecutive ones.
     calibration_m, calibration_rad
         Rms error of the poses due to the calibration of the camera.
-    split_m, split_rad
-        Rms errors by halves of the images, see `split_half`: those of the covariance and more.
+    split
+        Rms errors (m, rad) by halves of the images, see `split_half`: those of the covariance and
+        more. None if they were not compared.
     range_m
         Rms error by errors of the range that differ from place to place, see `error_by_range`.
     corrected
@@ -162,20 +163,14 @@ class ObservedErrors:
     excess_m: float = 0.0
     calibration_m: float = 0.0
     calibration_rad: float = 0.0
-    split_m: float = 0.0
-    split_rad: float = 0.0
+    split: tuple[float, float] | None = None
     range_m: float = 0.0
     corrected: bool = False
 
     @property
-    def scale_degrees(self) -> Float64:
-        """(2,) degrees of freedom of the mean squares as estimates."""
-        return np.where(self.is_measured & (not self.corrected), _MEASURED_DOF, _MODEL_DOF)
-
-    @property
-    def is_measured(self) -> Bool:
-        """(2,) whether halves of the images measured errors of positions and of rotations."""
-        return np.array([self.split_m, self.split_rad]) > 0
+    def scale_degrees(self) -> float:
+        """Degrees of freedom of the mean squares as estimates."""
+        return _MODEL_DOF if self.split is None or self.corrected else _MEASURED_DOF
 
     def of_other_sensors(self) -> ObservedErrors:
         """Return those that remain if the covariance is scaled by `scale_of_registrations`."""
@@ -189,11 +184,13 @@ class ObservedErrors:
         by_covariance
             (2,) mean squares by the covariance.
         """
-        split = np.array([self.split_m, self.split_rad]) ** 2
-        # If halves show less, neither is wrong for certain: their mean.
-        measured = np.maximum(split, 0.5 * (split + by_covariance))
+        noise = by_covariance
+        if self.split is not None:
+            split = np.square(self.split)
+            # If halves show less, neither is wrong for certain: their mean.
+            noise = np.maximum(split, 0.5 * (split + by_covariance))
         return {
-            "noise": np.where(self.is_measured, measured, by_covariance),
+            "noise": noise,
             "refinement": UNKNOWN_FRACTION * np.array([self.moved_m, self.moved_rad]) ** 2,
             "disagreement": UNKNOWN_FRACTION * np.array([self.excess_m, 0.0]) ** 2,
             "calibration": np.array([self.calibration_m, self.calibration_rad]) ** 2,
@@ -496,7 +493,7 @@ def accuracy_of(
         ),
         unbounded_frames,
         causes_m=causes_m if np.isfinite(position) else {},
-        degrees=float(observed.scale_degrees[0]),
+        degrees=observed.scale_degrees,
     )
 
 
@@ -528,7 +525,7 @@ def scale_of_registrations(
 def bound_by_covariance(C: Float64) -> float:
     """95 % bound on the rms error of positions with covariance (3m, 3m), which is all evidence."""
     square, degrees = _of_chosen(C, np.ones(len(C) // 3, np.bool_))
-    return float(_bounds(np.array(square), np.array(degrees), np.array(_MODEL_DOF)))
+    return float(_bounds(np.array(square), np.array(degrees), _MODEL_DOF))
 
 
 def covariances_of(
@@ -548,8 +545,7 @@ def covariances_of(
     scale = np.repeat(np.sqrt(np.maximum(_ratio(noise, squares), 1.0)), 3)
     C = covariances.of_poses * np.outer(scale, scale)
     C[1:] += np.diag(np.repeat(more / 3, 3))
-    factor = np.repeat(np.sqrt([factor_of(d) for d in observed.scale_degrees]), 3)
-    return np.asarray(C * np.outer(factor, factor), np.float64)
+    return np.asarray(C * factor_of(observed.scale_degrees), np.float64)
 
 
 def factor_of(degrees: float) -> float:
@@ -624,7 +620,7 @@ def _remove_motion(C: Float64, motion: Float64, chosen: Bool) -> Float64:
     return np.asarray(projector @ C @ projector.T, np.float64)
 
 
-def _bounds(squares: Float64, degrees: Float64, scale_degrees: Float64) -> Float64:
+def _bounds(squares: Float64, degrees: Float64, scale_degrees: float) -> Float64:
     """95 % bounds on rms errors with these expected mean squares.
 
     The ratio of the mean square of errors with some degrees of freedom to an estimate of it with
