@@ -130,6 +130,20 @@ def _store(assembly: Assembly, rng: np.random.Generator) -> None:
     _boxes(assembly, rng, 18, (-3, -1.5), (3, 0.9), clear=0.7)
 
 
+def _aisle(assembly: Assembly, rng: np.random.Generator) -> None:
+    """Add an aisle between two rows of shelves, with a wall at its end."""
+    shell(assembly, (-1, -1.5, 0), (8, 1.5, 2.8), [unusual.PLASTER] * 4, unusual.GROUND,
+          unusual.WHITE)  # fmt: skip
+    for side in (-1, 1):
+        for height in (0.3, 0.9, 1.5, 2.1):
+            corners = (-1, side * 0.9, height), (7, side * 1.5, height + 0.03)
+            assembly.add(unusual.WOOD, meshes.box_between(*np.sort(corners, axis=0)))
+            for x in np.arange(-0.8, 6.9, 0.4):
+                size = rng.uniform((0.1, 0.1, 0.08), (0.35, 0.4, 0.5))
+                body = meshes.box(size, (x, side * 1.2, height + 0.03 + size[2] / 2))
+                assembly.add(unusual.THINGS[int(rng.integers(5))], body)
+
+
 def _bare(assembly: Assembly, rng: np.random.Generator) -> None:
     """Add a room with plain walls, a column and few boxes."""
     shell(assembly, (-2.6, -2.2, 0), (2.0, 2.6, 2.5), [unusual.PLASTER] * 4, unusual.GROUND,
@@ -198,6 +212,17 @@ def _aside(rng: np.random.Generator) -> Path:
     return unusual.together(out, unusual.handheld(rng, 0.01, 1.0))
 
 
+def _ahead(rng: np.random.Generator) -> Path:
+    """Walk straight ahead."""
+    seconds, far = (FRAMES - 1) / RATE_HZ, rng.uniform(3.5, 4.5)
+
+    def path(t: float) -> Float64:
+        at = np.array([far * t / seconds, 0, 1.3])
+        return paths.look_at(at, at + np.array([1, 0, -0.1]))
+
+    return unusual.together(path, unusual.handheld(rng, 0.02, 1.5))
+
+
 def _orbit(rng: np.random.Generator) -> Path:
     walk = unusual.around(1.1, 0.6, (0, 0, 0.05), (FRAMES - 1) / RATE_HZ)
     return unusual.together(walk, unusual.handheld(rng, 0.02, 1.5))
@@ -212,6 +237,7 @@ SCENES: dict[str, tuple[Fill, Motion]] = {
     "store, pan": (_store, _pan),
     "bare room, turn": (_bare, _turn),
     "office, aside": (_office, _aside),
+    "aisle, ahead": (_aisle, _ahead),
     "table, orbit": (_objects, _orbit),
 }
 
