@@ -26,6 +26,7 @@ from tofuse.engine.arrays import Float32
 from tofuse.engine.cameras import ray_lengths
 from tofuse.engine.frames.frames import RangeFrame
 from tofuse.engine.frames.recording import ArraySource, Recording
+from tofuse.engine.mapping.config import Config
 from tofuse.engine.mapping.reconstructing import reconstruct
 from tofuse.engine.quality.trajectory_errors import displacement
 from tofuse.engine.refinement import fixed_pattern
@@ -66,9 +67,9 @@ def with_errors(recording: Recording, errors: Callable[[RangeFrame], Float32]) -
     return Recording.of(source, recording.path, recording.format)
 
 
-def judged(recording: Recording) -> tuple[float, float]:
+def judged(recording: Recording, config: Config | str = "default") -> tuple[float, float]:
     """Return the rms error of the poses and the stated bound, mm."""
-    result = reconstruct(recording)
+    result = reconstruct(recording, config)
     truth, posed = recording.reference, result.has_pose
     assert truth is not None
     error = displacement(truth[posed], result.trajectory[posed])[0] if posed.sum() > 2 else np.inf

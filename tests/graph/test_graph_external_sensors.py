@@ -11,6 +11,7 @@ import pytest
 
 from corner_views import SHARP, corner
 from tofuse.engine.geometry import se3
+from tofuse.engine.graph import external_sensors
 from tofuse.engine.graph.external_sensors import (
     GravityEdges,
     OdometryEdges,
@@ -275,6 +276,89 @@ def test_jump_of_odometry_is_left_out():
     steps = measured.between([0, 4, 8, 12, 39, 42])
     assert [(s.i, s.j) for s in steps] == [(0, 4), (4, 8), (12, 39)]
     np.testing.assert_allclose(steps[1].T_i_j, se3.inverse(holes[4]) @ holes[8], atol=1e-9)
+
+
+@pytest.mark.parametrize(("factor", "differs"), [(1.0, False), (0.95, True), (1.03, True)])
+def test_wrong_radius_of_wheels_is_estimated(factor, differs) -> None:
+    """Where images constrain the motion; where they don't, odometry has the right lengths, too."""
+    right, graph = walked(0 * NODDING)
+    wall = (np.arange(N) >= 30) & (np.arange(N) < 50)
+    wheels = odometer(right, 0.005)
+    wheels[:, :3, 3] *= factor
+    measured = measure_all((OdometryEdges(),), sensed(wheels, degenerate=wall), graph)
+    assert measured.verified
+    assert (measured.lengths != 1) is differs
+    assert measured.lengths == pytest.approx(1 / factor, rel=0.01 if differs else 1e-9)
+    assert ("multiplied" in measured.records[0].text) is differs
+    true = se3.inverse(right[:-1]) @ right[1:]
+    ratio = [
+        np.linalg.norm(s.T_i_j[:3, 3]) / np.linalg.norm(true[s.i, :3, 3]) for s in measured.steps
+    ]
+    assert np.median(ratio) == pytest.approx(1, abs=0.01)
+
+
+def test_unknown_lengths_count_along_runs_that_images_do_not_constrain(monkeypatch) -> None:
+    """As an error that all steps of a run share: its end has that of the whole length."""
+    steps = np.tile(se3.exp(np.array([0.2, 0, 0, 0, 0, 0.1])), (30, 1, 1))
+    is_open = (np.arange(30) >= 5) & (np.arange(30) < 15)
+    length = float(np.linalg.norm(steps[0, :3, 3]))
+    C = external_sensors._Lengths(1.0, 0.02).covariances(steps, is_open)
+    assert not C[~is_open].any()
+    assert np.trace(C[is_open].sum(0)) == pytest.approx((0.02 * 10 * length) ** 2)
+    right, graph = walked(0 * NODDING)
+    wall = np.arange(N) >= 20
+    odometry = sensed(odometer(right), degenerate=wall)
+    unknown = measure_all((OdometryEdges(),), odometry, graph)
+    monkeypatch.setattr(external_sensors, "_LENGTHS", 1e-6)
+    known = measure_all((OdometryEdges(),), odometry, graph)
+    before, within = (
+        [np.linalg.inv(m.steps[k].information)[:3, :3].trace() for m in (known, unknown)]
+        for k in (5, 40)
+    )
+    assert before[1] == pytest.approx(before[0], rel=1e-6)
+    assert within[1] > 1.2 * within[0]
+
+
+def test_slip_within_the_errors_of_each_step_is_left_out(monkeypatch) -> None:
+    """Then as much slip is expected where images can't show it."""
+    monkeypatch.setattr(external_sensors, "_COMPARED", 15)  # as of a longer recording
+    right, graph = walked(0 * NODDING)
+    wall = np.arange(N) >= 50
+    wheels = odometer(right, 0.002)
+    slow = se3.exp(np.array([0, 0, 0.03, 0, 0, 0]))
+    steps = se3.inverse(wheels[:-1]) @ wheels[1:]
+    steps[21:25] = steps[21:25] @ slow
+    slipping = np.stack([*itertools.accumulate([wheels[0], *steps], np.matmul)])
+    plain, slipped = (
+        measure_all((OdometryEdges(),), sensed(odometry, degenerate=wall), graph)
+        for odometry in (wheels, slipping)
+    )
+    assert len(plain.steps) == N - 1
+    assert set(range(N - 1)) - {step.i for step in slipped.steps} == {21, 22, 23, 24}
+    assert slipped.verified
+    last = [np.linalg.inv(m.steps[-1].information)[2, 2] for m in (plain, slipped)]
+    assert last[1] - last[0] > 0.9 * 4 * 0.03**2 / 50
+
+
+def test_poses_of_a_robot_base_are_named() -> None:
+    right, graph = walked(0 * NODDING)
+    T_body_camera = se3.inverse(se3.exp(np.array([0.3, 0, 0.2, 0, 0, 0])))
+    T_body_camera[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    base = odometer(right) @ se3.inverse(T_body_camera)
+    measured = measure_all((OdometryEdges(),), sensed(base), graph)
+    assert not measured.steps
+    assert "turned by 120 degrees" in measured.records[0].text
+    unrelated = measure_all((OdometryEdges(),), sensed(odometer(right[::-1])), graph)
+    assert "turned" not in unrelated.records[0].text
+
+
+def test_loops_may_contradict_odometry_by_several_times_its_errors() -> None:
+    right, graph = walked(0 * NODDING)
+    wall = np.arange(N) >= 40
+    measured = measure_all((OdometryEdges(),), sensed(odometer(right), degenerate=wall), graph)
+    doubted = measured.doubted(measured.steps)
+    np.testing.assert_allclose(doubted[7].information * 25, measured.steps[7].information)
+    assert replace(measured, verified=False).doubted(measured.steps) == []
 
 
 @pytest.mark.parametrize(("wrong", "verified"), [(2, True), (8, False)])

@@ -27,7 +27,7 @@ from tofuse.engine.quality.map_agreement import (
     consistency_of_images,
     map_consistency,
 )
-from tofuse.formats.poses.trajectory import associated_poses, write_tum
+from tofuse.formats.poses.trajectory import associated_poses, interpolated_poses, write_tum
 from tofuse.formats.readers.native import NativeSource
 from written_run_json import write_run
 
@@ -253,6 +253,22 @@ def test_poses_are_assigned_to_nearest_frame() -> None:
     assert np.isnan(out[0]).all()
     assert np.array_equal(out[1], T[1])  # the last of two poses for it
     assert np.array_equal(out[2], T[2])
+
+
+def test_odometry_is_interpolated_between_its_poses() -> None:
+    """The clocks of wheels and of a camera don't tick together."""
+    T = path(5)
+    times = [0.0, 0.2, 0.4, 1.2, 1.4]  # a gap of 0.8 s
+    order = [3, 0, 4, 1, 2]
+    at = [-0.03, -0.01, 0.0, 0.05, 0.4, 0.6, 1.3, 1.41, 1.5]
+    out = interpolated_poses(at, np.array(times)[order], T[order])
+    unknown = np.isnan(out).all((1, 2))
+    assert unknown.tolist() == [True, False, False, False, False, True, False, False, True]
+    np.testing.assert_allclose(out[[1, 2, 4, 7]], T[[0, 0, 2, 4]], atol=1e-12)
+    quarter, half = se3.log(se3.inverse(T[[0, 3]]) @ out[[3, 6]])
+    np.testing.assert_allclose(quarter, 0.25 * se3.log(se3.inverse(T[0]) @ T[1]), atol=1e-9)
+    np.testing.assert_allclose(half, 0.5 * se3.log(se3.inverse(T[3]) @ T[4]), atol=1e-9)
+    assert np.isnan(interpolated_poses(at, [], np.zeros((0, 4, 4)))).all()
 
 
 def test_depths_are_requantized_to_recording_unit() -> None:

@@ -42,6 +42,14 @@ _BETTER = 0.5
 _MIN_COMPARED = 10
 # Devices jump rarely: if more of the steps are rejected, their errors are other ones than assumed.
 _MAX_REJECTED = 0.1
+# Standard deviation of the factor on all lengths of odometry, as of wheels whose radius is not well
+# known, and how much likelier it must be that they differ from tracked ones at all.
+_LENGTHS, _LIKELIER = 0.02, 10.0
+_MOUNTING_ROUNDS = 5
+_MAX_LENGTHS = 5.0  # largest error of lengths, in units of this
+# Factor on the errors of odometry within which loops may contradict it where images don't constrain
+# the motion: wheels may slip there.
+_DOUBT = 5.0
 # Squared disagreement, in units of tracking's errors, that one in a hundred motions of independent
 # odometry does not reach: if half of all don't, these errors are odometry's as well.
 _SHARED = float(chdtri(6, 0.99))
@@ -115,6 +123,8 @@ class SensorPriors:
         One for each sensor, for the report.
     witness
         Steps of odometry that poses are compared with, but which don't change them.
+    lengths
+        Factor by which the lengths of odometry were multiplied, see `OdometryEdges`.
     """
 
     steps: tuple[Measured, ...] = ()
@@ -125,6 +135,7 @@ class SensorPriors:
     verified: bool = False
     depth_scale: tuple[float, float] = (1.0, 1.0)
     witness: tuple[Measured, ...] = ()
+    lengths: float = 1.0
 
     def __bool__(self) -> bool:
         return bool(self.steps or self.ids)
@@ -140,6 +151,7 @@ class SensorPriors:
             (*self.records, *other.records),
             self.verified or other.verified,
             self.depth_scale if self.steps else other.depth_scale,
+            lengths=self.lengths if self.steps else other.lengths,
         )
 
     @property
@@ -152,6 +164,12 @@ class SensorPriors:
         """Return the measurements with a `depth_scale` of at least this."""
         translation, rotation = np.maximum(self.depth_scale, least).tolist()
         return replace(self, depth_scale=(translation, rotation))
+
+    def doubted(self, steps: Sequence[Measured]) -> list[Measured]:
+        """Return steps with the errors that the search for loops allows for; none if unverified."""
+        if not self.verified:
+            return []
+        return [replace(step, information=step.information / _DOUBT**2) for step in steps]
 
     def gravity_of(self, ids: Sequence[int]) -> Gravity | None:
         """Gravity at the vertices `ids` of a graph; None if none of them has it."""
@@ -267,11 +285,13 @@ class GravityEdges(Bounded, ExternalSensor):
 class OdometryEdges(Bounded, ExternalSensor):
     """Connects consecutive frames by the motion between their poses in an odometry file.
 
-    Its errors are random walks over time, length and angle. They are scaled until these and the
-    errors of tracking explain the disagreement of the two; single steps with a far larger one are
-    rejected. Odometry that agrees with tracking better than the errors of tracking allow shares
-    them, as if it were computed from the same depth. Then it is no evidence, except where the
-    depth has none.
+    Its errors are random walks over time, length and angle, and a factor on all lengths, as by a
+    wrong radius of wheels. The walks are scaled until these and the errors of tracking explain the
+    disagreement of the two; steps with a far larger one, alone or together, are rejected. Where
+    images don't constrain the motion, as many jumps are expected among the others. The lengths are
+    corrected if it is far likelier that they differ, by a Bayesian comparison. Odometry that agrees
+    with tracking better than the errors of tracking allow shares them, as if it were computed from
+    the same depth. Then it is no evidence, except where the depth has none.
 
     Attributes
     ----------
@@ -303,17 +323,21 @@ class OdometryEdges(Bounded, ExternalSensor):
         first = np.flatnonzero(consecutive)
         if not len(first):
             return SensorPriors()
-        measured = se3.inverse(sensed.odometry[first]) @ sensed.odometry[first + 1]
-        variances = self._variances(measured, sensed.times[first + 1] - sensed.times[first])
+        stated = se3.inverse(sensed.odometry[first]) @ sensed.odometry[first + 1]
+        variances = self._variances(stated, sensed.times[first + 1] - sensed.times[first])
         tracked = se3.inverse(graph.poses[first]) @ graph.poses[first + 1]
         tracking_covariance = _covariance_to_reference(graph)
-        misfit = se3.log(se3.inverse(tracked) @ measured)
-        used = np.ones(len(first), bool)
+        used, slipped = np.ones(len(first), bool), np.zeros(len(first), bool)
         # Then without the rejected steps: a jump is in all longer motions over it.
         for _ in range(2):
-            compared = None
+            compared, lengths = None, _Lengths()
             if self.scale is None:
                 compared = _compare(sensed, graph, variances[used], first[used])
+            if compared is not None and compared.verified:
+                lengths = compared.lengths((_BETTER, self.limit))
+                compared = replace(compared, odometry=lengths.corrected(compared.odometry))
+            measured = lengths.corrected(stated)
+            misfit = se3.log(se3.inverse(tracked) @ measured)
             found = (
                 np.full((2, 2), self.scale or 1.0)
                 if compared is None
@@ -324,18 +348,29 @@ class OdometryEdges(Bounded, ExternalSensor):
                     f"the odometry differs from the tracked motion by more than {self.limit:g} "
                     "times its errors, so it was not used"
                 )
+                body = None if compared is None else compared.mounting((_BETTER, self.limit))
+                if body is not None:
+                    text += (
+                        f"; it agrees for a camera turned by {np.degrees(se3.angle(body)):.0f} "
+                        "degrees: are the poses those of a robot's base? They must be the camera's"
+                    )
                 return SensorPriors(records=(SensorRecord("odometry", len(first), 0, None, text),))
             scales, odometry_scale = found, found[1]
-            stated = (variances * np.repeat(np.maximum(odometry_scale, 1) ** 2, 3))[:, :, None]
+            enlarged = (variances * np.repeat(np.maximum(odometry_scale, 1) ** 2, 3))[:, :, None]
             chi2 = _squared(
                 misfit,
-                stated * np.eye(6) + tracking_covariance[first] + tracking_covariance[first + 1],
+                enlarged * np.eye(6) + tracking_covariance[first] + tracking_covariance[first + 1],
             )
-            used = chi2 <= self.gate
+            if compared is not None and compared.verified:
+                slipped |= compared.beyond(scales, self.gate, len(sensed.ids))[first]
+            used = (chi2 <= self.gate) & ~slipped
             if used.all() or not used.any():
                 break
         C = (variances * np.repeat(odometry_scale**2, 3))[:, :, None] * np.eye(6)
         open_step = sensed.degenerate[first] | sensed.degenerate[first + 1]
+        C += lengths.covariances(measured, open_step)
+        jumps = misfit[~used & ~open_step]
+        C[open_step] += jumps.T @ jumps / max(int((~open_step).sum()), 1)
         # Odometry that is mostly wrong where images can tell bounds nothing where they can't.
         is_wrong = not open_step.all() and bool(used[~open_step].mean() < 0.5)
         shared = compared is not None and compared.shares_errors
@@ -363,10 +398,14 @@ class OdometryEdges(Bounded, ExternalSensor):
                 ", those where images don't constrain the motion: it agrees with the tracked "
                 "motion better than the errors of the depth allow, as if it were computed from it"
             )
+        if lengths.factor != 1:
+            text += f"; its lengths are multiplied by {lengths.factor:.3f}, as tracked ones differ"
         metric = compared is not None and compared.lengths_agree(scales)
         record = SensorRecord("odometry", len(first), len(kept), scale, text, metric)
         verified = self.scale is not None or (compared is not None and compared.verified)
-        return SensorPriors(steps, records=(record,), verified=verified and not is_wrong)
+        return SensorPriors(
+            steps, records=(record,), verified=verified and not is_wrong, lengths=lengths.factor
+        )
 
     def _variances(self, steps: Float64, seconds: Float64) -> Float64:
         """(K, 6) of motions (K, 4, 4)."""
@@ -379,6 +418,46 @@ class OdometryEdges(Bounded, ExternalSensor):
         return np.repeat(np.stack(variance, 1), 3, axis=1)
 
 
+@dataclass(frozen=True)
+class _Lengths:
+    """A factor that lengths of odometry are multiplied by, and its standard deviation."""
+
+    factor: float = 1.0
+    sigma: float = 0.0
+
+    def corrected(self, motions: Float64) -> Float64:
+        """Return motions (K, 4, 4) with the corrected lengths."""
+        out = motions.copy()
+        out[:, :3, 3] *= self.factor
+        return out
+
+    def covariances(self, steps: Float64, open_steps: Bool) -> Float64:
+        """Return the covariances (K, 6, 6) that make `sigma` count along runs of open steps.
+
+        All steps share the error. As if they were independent, each of a run gets as much as makes
+        the error at its end right. Elsewhere images measure the lengths.
+        """
+        runs = np.cumsum(np.diff(open_steps, prepend=False))  # also of steps that aren't open
+        along = _along(steps)
+        length = np.linalg.norm(along, axis=1)
+        of_run = np.bincount(runs, length)[runs]
+        per_length = np.divide(of_run, length, out=np.zeros(len(length)), where=length > 0)
+        weight = np.where(open_steps, self.sigma**2 * per_length, 0.0)
+        return np.asarray(weight[:, None, None] * along[:, :, None] * along[:, None, :])
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Factors on the errors (2, 2), see `_Comparison.scales`; relative error of the lengths; cost.
+
+    The cost is the negative logarithm of the likelihood and the prior.
+    """
+
+    scales: Float64
+    length_error: float
+    cost: float
+
+
 @dataclass(frozen=True, eq=False)
 class _Comparison:
     """The same K motions by the tracker and by odometry.
@@ -389,6 +468,8 @@ class _Comparison:
         (K, 4, 4), and (K, 6, 6) as right perturbations.
     odometry, variances
         (K, 4, 4), and (K, 6) by the stated errors.
+    ends
+        (K, 2) positions of their first and last frames.
     spans
         (K,) number of compared frames from the first to the last.
     verified
@@ -399,6 +480,7 @@ class _Comparison:
     covariances: Float64
     odometry: Float64
     variances: Float64
+    ends: Intp
     spans: Intp
     verified: bool
 
@@ -410,25 +492,93 @@ class _Comparison:
         Each of translation and of rotation, within the given limits; None if they don't explain
         the disagreement.
         """
-        misfit = self._misfit
+        fit = self._fit(registrations, odometry)
+        median = float(np.median(_squared(self._misfit, self._covariances(fit.scales))))
+        return fit.scales if median <= 2 * MEDIAN else None
+
+    def beyond(self, scales: Float64, gate: float, frames: int) -> Bool:
+        """Return from which of all frames odometry is in a motion that disagrees beyond the gate.
+
+        Of the shortest motions only. A wheel that slips for a while shows in them, where each step
+        is within its errors.
+        """
+        squares = _squared(self._misfit, self._covariances(scales))
+        out = np.zeros(frames, np.bool_)
+        for a, b in self.ends[(self.spans == 1) & (squares > gate)]:
+            out[a:b] = True
+        return out
+
+    def mounting(self, odometry: tuple[float, float]) -> Float64 | None:
+        """Return the pose T_body_camera (4, 4) with which both agree; None if none does.
+
+        As a hand-eye calibration by the shortest motions: its turn takes axes and translations of
+        the tracked ones to those of odometry, less what the arm moves as the body turns.
+        """
+        part = next(self.by_length(), None)
+        if part is None:
+            return None
+        T_body_camera, R, t = np.eye(4), part.odometry[:, :3, :3], part.odometry[:, :3, 3]
+        tracked = np.concatenate([se3.log(part.tracked)[:, 3:], part.tracked[:, :3, 3]])
+        for _ in range(_MOUNTING_ROUNDS):
+            moved = t - ((np.eye(3) - R) @ T_body_camera[:3, 3])
+            U, _, Vt = np.linalg.svd(
+                np.concatenate([se3.log(part.odometry)[:, 3:], moved]).T @ tracked
+            )
+            T_body_camera[:3, :3] = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+            left = t - part.tracked[:, :3, 3] @ T_body_camera[:3, :3].T
+            arm = np.linalg.lstsq((np.eye(3) - R).reshape(-1, 3), left.ravel(), rcond=1e-3)[0]
+            T_body_camera[:3, 3] = arm
+        as_camera = np.asarray(se3.inverse(T_body_camera) @ part.odometry @ T_body_camera)
+        agrees = replace(part, odometry=as_camera).scales((1.0, 1.0), odometry) is not None
+        return T_body_camera if agrees else None
+
+    def lengths(self, odometry: tuple[float, float]) -> _Lengths:
+        """Return the factor on the lengths of odometry; it is 1 unless another is far likelier.
+
+        From motions over the number of frames over which they tell most: longer ones are sums of
+        shorter ones, so that together they would seem to tell more than they do.
+        """
+        if not (parts := list(self.by_length())):
+            return _Lengths(sigma=_LENGTHS)
+        part = max(parts, key=lambda part: part._length_information(np.ones((2, 2))))
+        same, differ = (part._fit((1.0, 1.0), odometry, sigma) for sigma in (0.0, _LENGTHS))
+        information = part._length_information(differ.scales) + _LENGTHS**-2
+        # By Laplace's approximation.
+        likelier = same.cost - differ.cost - 0.5 * np.log(information * _LENGTHS**2)
+        factor = 1 - differ.length_error if likelier > np.log(_LIKELIER) else 1.0
+        return _Lengths(factor, float(1 / np.sqrt(information)))
+
+    def _fit(
+        self,
+        registrations: tuple[float, float],
+        odometry: tuple[float, float],
+        lengths: float = 0.0,
+    ) -> _Fit:
+        """Fit the factors within their limits, and an error of lengths with this sigma."""
         from scipy.optimize import minimize  # slow to import
 
+        misfit, along = self._misfit, _along(self.odometry)
         weight = 1 / self.spans  # about as many are independent as don't overlap
 
-        def cost(logarithms: Float64) -> float:
-            C = self._covariances(np.exp(logarithms).reshape(2, 2))
+        def cost(x: Float64) -> float:
+            C = self._covariances(np.exp(x[:4]).reshape(2, 2))
+            left = misfit - lengths * x[4] * along
             likelihood = 0.5 * np.linalg.slogdet(C)[1] + 0.5 * (_DEGREES + 6) * np.log1p(
-                _squared(misfit, C) / _DEGREES
+                _squared(left, C) / _DEGREES
             )
-            prior = 0.5 * float((logarithms[2:] ** 2).sum()) / _SPREAD**2
+            prior = 0.5 * float((x[2:4] ** 2).sum() / _SPREAD**2 + x[4] ** 2)
             return float((weight * likelihood).sum()) + prior
 
         low, high = np.log(np.repeat([registrations, odometry], 2, axis=0)).T
-        bounds = list(zip(low, high, strict=True))
-        fit = minimize(cost, 0.3 * high, method="L-BFGS-B", bounds=bounds)
-        found = np.exp(fit.x).reshape(2, 2)
-        median = float(np.median(_squared(misfit, self._covariances(found))))
-        return found if median <= 2 * MEDIAN else None
+        free = _MAX_LENGTHS if lengths else 0.0
+        bounds = [*zip(low, high, strict=True), (-free, free)]
+        fit = minimize(cost, np.append(0.3 * high, 0.0), method="L-BFGS-B", bounds=bounds)
+        return _Fit(np.exp(fit.x[:4]).reshape(2, 2), lengths * float(fit.x[4]), float(fit.fun))
+
+    def _length_information(self, scales: Float64) -> float:
+        """Information of the motions on an error of the lengths of odometry."""
+        along = _along(self.odometry)
+        return float((_squared(along, self._covariances(scales)) / self.spans).sum())
 
     def by_length(self) -> Iterator[_Comparison]:
         """Yield those over each number of frames, if there are several."""
@@ -440,6 +590,7 @@ class _Comparison:
                     self.covariances[of],
                     self.odometry[of],
                     self.variances[of],
+                    self.ends[of],
                     self.spans[of],
                     self.verified,
                 )
@@ -516,6 +667,7 @@ def _compare(
         covariances,
         np.asarray(se3.inverse(sensed.odometry[a]) @ sensed.odometry[b], np.float64),
         variance[b] - variance[a],
+        np.stack([a, b], 1),
         j - i,
         verified,
     )
@@ -538,6 +690,8 @@ def with_depth_scale(measured: SensorPriors, sensed: SensorData, graph: PoseGrap
     alike are invisible to them: by their number they seem far more accurate than they are. Those of
     odometry were estimated from single registrations, which claim less.
     """
+    odometry = _Lengths(measured.lengths).corrected(sensed.odometry)
+    sensed = replace(sensed, odometry=odometry)
     row = {int(index): k for k, index in enumerate(sensed.ids)}
     first = np.array([row[step.i] for step in measured.steps], np.intp)
     information = np.array([step.information for step in measured.steps])
@@ -569,6 +723,13 @@ def _covariance_to_reference(graph: PoseGraph) -> Float64:
     out = np.zeros((len(graph.ids), 6, 6))
     out[graph.edges[:, 1]] = np.linalg.inv(graph.information)
     return out
+
+
+def _along(motions: Float64) -> Float64:
+    """Right perturbations (K, 6) of motions (K, 4, 4) by a relative error of their lengths."""
+    along = np.zeros((len(motions), 6))
+    along[:, :3] = np.einsum("kji,kj->ki", motions[:, :3, :3], motions[:, :3, 3])
+    return along
 
 
 def _scaled(C: Float64, factors: Float64) -> Float64:

@@ -104,6 +104,11 @@ class BackEnd:
         # For the search, assume that motion in degenerate directions may differ from the rest.
         degenerate = bool(self._tracked.unobservable)
         conservative = self._tracked.build((), conservative=True) if degenerate else tracked
+        sensors = external_sensors.SensorPriors()
+        if self._config.priors:
+            sensors = external_sensors.measure_all(self._config.priors, *self._measured(tracked))
+            steps = self._tracked.steps_at_degenerate(sensors)
+            conservative = conservative.with_edges(sensors.doubted(steps))
         detected = self._observations.loops.finish(self._tracked.poses, _covariances(conservative))
         loops = with_joins(detected, self._tracked.joins)
         del conservative
@@ -111,9 +116,6 @@ class BackEnd:
         graph = self._tracked.build(loops)
         # Poses before loop closure, without and with external sensors.
         sequential = aided = graph.poses
-        sensors = external_sensors.SensorPriors()
-        if self._config.priors:
-            sensors = external_sensors.measure_all(self._config.priors, *self._measured(tracked))
         optimisation = Optimisation(external_sensors.with_sensors(graph, sensors), (), True)
         confirmed: frozenset[int] = frozenset()
         if graph.loop.any() or sensors:

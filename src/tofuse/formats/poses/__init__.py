@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from tofuse.formats.poses.pose import pose_text, read_loops, read_pose
     from tofuse.formats.poses.trajectory import (
         associated_poses,
+        interpolated_poses,
         read_tum,
         write_kitti,
         write_log,

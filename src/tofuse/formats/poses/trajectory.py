@@ -13,8 +13,10 @@ from tofuse.engine import quantities
 from tofuse.engine.arrays import Float64
 from tofuse.engine.errors import InputError
 from tofuse.engine.geometry import quaternion, se3
-from tofuse.engine.times import partners
+from tofuse.engine.times import MAX_GAP_S, partners
 from tofuse.formats.files import atomic, reading, tables
+
+_MAX_INTERVAL_S = 0.5  # of poses to interpolate between
 
 
 def read_tum(path: str | Path) -> tuple[Float64, Float64]:
@@ -193,4 +195,28 @@ def associated_poses(timestamps: ArrayLike, others: ArrayLike, poses: ArrayLike)
     index = partners(timestamps, others)
     out = np.full((len(index), 4, 4), np.nan)
     out[index >= 0] = np.asarray(poses, float)[index[index >= 0]]
+    return out
+
+
+def interpolated_poses(timestamps: ArrayLike, others: ArrayLike, poses: ArrayLike) -> Float64:
+    """Return poses (N, 4, 4) at timestamps (N,), between those (M, 4, 4) at others (M,).
+
+    NaN more than 0.02 s before the first or after the last, and between poses more than half a
+    second apart.
+    """
+    at, others, poses = (np.asarray(x, float) for x in (timestamps, others, poses))
+    out = np.full((len(at), 4, 4), np.nan)
+    order = np.argsort(others, kind="stable")
+    order = order[np.isfinite(others[order])]
+    if not len(order):
+        return out
+    times, T = others[order], poses[order]
+    after = np.searchsorted(times, at)
+    a, b = (after - 1).clip(0), after.clip(0, len(times) - 1)
+    span = times[b] - times[a]
+    fraction = np.where(span > 0, (at - times[a]) / np.where(span > 0, span, 1), 0.0)
+    inside = (span <= _MAX_INTERVAL_S) & (fraction >= 0) & (fraction <= 1)
+    nearest = np.minimum(np.abs(at - times[a]), np.abs(at - times[b]))
+    valid = np.where(a == b, nearest <= MAX_GAP_S, inside)
+    out[valid] = se3.interpolate(T[a[valid]], T[b[valid]], fraction[valid])
     return out

@@ -26,6 +26,7 @@ from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.geometry import unpacked_color
 from tofuse.formats.images import as_color, parse_image
+from tofuse.formats.poses import interpolated_poses
 from tofuse.formats.sources.file_source import FileSource
 from tofuse.formats.sources.imu import ACCELERATION
 from tofuse.formats.sources.pixels import finite_float32, sampled_color
@@ -534,8 +535,6 @@ def cloud(message: Any, where: str) -> GeometryRecord:
 _TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")  # of ROS 2 and 1
 _ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 _STATIC = "static"  # in the name of the topic
-# Largest interval between transforms to interpolate, and largest extrapolation, s.
-_MAX_GAP_S, _MAX_EXTRAPOLATION_S = 0.5, 0.02
 _MAX_DEPTH = 64
 
 
@@ -556,16 +555,7 @@ class _Edge:
         """Return T_parent_child (M, 4, 4) at times (M,), NaN where unknown."""
         if self.static:
             return np.broadcast_to(self.T[-1], (len(times), 4, 4))
-        out = np.full((len(times), 4, 4), np.nan)
-        after = np.searchsorted(self.times, times)
-        a, b = (after - 1).clip(0), after.clip(0, len(self.times) - 1)
-        span = self.times[b] - self.times[a]
-        fraction = np.where(span > 0, (times - self.times[a]) / np.where(span > 0, span, 1), 0.0)
-        inside = (span <= _MAX_GAP_S) & (fraction >= 0) & (fraction <= 1)
-        nearest = np.minimum(np.abs(times - self.times[a]), np.abs(times - self.times[b]))
-        valid = np.where(a == b, nearest <= _MAX_EXTRAPOLATION_S, inside)
-        out[valid] = se3.interpolate(self.T[a[valid]], self.T[b[valid]], fraction[valid])
-        return out
+        return interpolated_poses(times, self.times, self.T)
 
 
 class Transforms:

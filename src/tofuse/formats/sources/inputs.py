@@ -88,14 +88,21 @@ def files_at(path: Path, *suffixes: str) -> list[Path]:
     return reading.files_with(path, *suffixes) if reading.is_folder(path) else []
 
 
-def tum_poses(source: Source, path: Path) -> Float64:
-    """Return (N, 4, 4) poses of a TUM file at the source's timestamps, NaN without a match."""
+def tum_poses(
+    source: Source,
+    path: Path,
+    at: Callable[[Float64, Float64, Float64], Float64] = associated_poses,
+) -> Float64:
+    """Return (N, 4, 4) poses of a TUM file at the source's timestamps, NaN without a match.
+
+    Each frame has the pose nearest in time, or what `at` returns of timestamps, times and poses.
+    """
     times, poses = read_tum(path)
-    out = associated_poses(source.timestamps, times, poses)
+    out = at(source.timestamps, times, poses)
     posed = int(np.isfinite(out[:, 0, 0]).sum())
     if posed < len(out):
         source.warnings.append(
-            f"{path}: {posed} of {len(out)} frames have a pose within 0.02 s of their timestamp"
+            f"{path}: {posed} of {len(out)} frames have a pose at the time of their timestamp"
         )
     return out
 
