@@ -118,6 +118,14 @@ def test_odometry_that_one_path_rests_on_counts_in_the_map(session_results, tmp_
     found = merge_sessions(sessions, quick_merge(sessions), threads=2)
     (record,) = [p for p in found.diagnostics.priors if p.sensor == "odometry"]
     assert (record.measured, record.used) == (N - 1, N - 1)
+    # With the factor on the lengths of its wheels that the run found.
+    run = json.loads((with_odometry / "run.json").read_text())
+    change_run(with_odometry, priors=[{**p, "lengths": 1.02} for p in run["priors"]])
+    reopened = joined_recording(
+        read_sessions([with_odometry, session_results["there"]], 2, Silent())
+    )
+    longer = np.array(HERE)[:, :3, 3] * 1.02
+    np.testing.assert_allclose(reopened[0].odometry[:N, :3, 3], longer, atol=1e-6)
 
 
 def test_session_of_a_camera_on_its_side_is_joined(session_results, tmp_path) -> None:

@@ -119,11 +119,11 @@ def sessions_of(
         parts = list(reopening.stored_recordings(folder, run))
         posed = [{k: stated[part.first + k] for k in part.frames} for part in parts]
         links = _links(run, parts)
-        odometry_scale = _odometry_scale(run)
+        odometry = _odometry(run)
         up = run_json.rotation_up_world(run, folder / "run.json")[1]
     sessions = [
         replace(
-            _session(part, poses, odometry_scale, folder, threads, progress),
+            _session(part, poses, odometry, folder, threads, progress),
             roll=_mean_roll(poses.values(), components, up),
         )
         for part, poses in zip(parts, posed, strict=True)
@@ -148,18 +148,18 @@ def _links(
     return tuple((i, j) for i, j in loops if bisect_right(starts, i) != bisect_right(starts, j))
 
 
-def _odometry_scale(run: Mapping[str, Any]) -> float | None:
-    """Return the factor on the errors of the odometry that a path rests on; None if it doesn't."""
+def _odometry(run: Mapping[str, Any]) -> external_sensors.SensorRecord | None:
+    """Return the use of the odometry that a path rests on; None if it doesn't."""
     records = (external_sensors.SensorRecord(**p) for p in run.get("priors", ()))
     used = [r for r in records if r.sensor == "odometry" and r.used]
     reliable = external_sensors.SensorPriors(records=tuple(used)).is_reliable
-    return used[0].scale if used and reliable else None
+    return used[0] if used and reliable else None
 
 
 def _session(
     part: reopening.StoredRecording,
     stated: dict[int, given.StatedPose],
-    odometry_scale: float | None,
+    odometry: external_sensors.SensorRecord | None,
     folder: Path,
     threads: int | None,
     progress: Progress,
@@ -177,7 +177,7 @@ def _session(
         reopening.stored_config(part, folder), stated_accuracy(folder).moved_m
     )
     config = adaptation.adapted(config, recording, threads, progress)
-    recording, config = adaptation.with_known_odometry(recording, config, odometry_scale)
+    recording, config = adaptation.with_known_odometry(recording, config, odometry)
     opening = reopening.locate_recording(part.opening, folder)
     return Session(part.name, folder, opening, recording, config, stated, part)
 

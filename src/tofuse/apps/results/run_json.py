@@ -23,6 +23,8 @@ from tofuse.engine.results import FrameRecord, Mirror, Reason, Reconstruction, S
 from tofuse.formats.files import atomic, reading
 from tofuse.formats.poses import read_tum
 
+_OF_SENSOR = ("sensor", "measured", "used", "scale", "lengths", "text")
+
 
 def write_run_json(path: Path, result: Reconstruction) -> None:
     """Write `run.json`, schema 1: SI units and radians, null instead of NaN.
@@ -112,7 +114,7 @@ def _content(result: Reconstruction) -> dict[str, Any]:
             for p in d.parts
         ],
         "certificate": d.certified and d.certified.to_dict(),
-        "priors": [_fields(s, "sensor", "measured", "used", "scale", "text") for s in d.priors],
+        "priors": [_fields(s, *_OF_SENSOR) for s in d.priors],
         "refinement": _refinement(d.refinement),
         "filters": {name: {"removed": fraction} for name, fraction in d.removed.items()},
     }

@@ -88,8 +88,8 @@ class SensorData:
 class SensorRecord:
     """Use of a sensor: numbers of its measurements and of those used, and a sentence on it.
 
-    `scale` is the factor on its stated errors, None where they are not scaled; `metric` whether
-    tracked lengths agree with those that it measures.
+    `scale` is the factor on its stated errors, None where they are not scaled; `lengths` that on
+    its lengths, see `OdometryEdges`; `metric` whether tracked lengths agree with those.
     """
 
     sensor: str
@@ -97,6 +97,7 @@ class SensorRecord:
     used: int
     scale: float | None
     text: str
+    lengths: float = 1.0
     metric: bool = False
 
 
@@ -401,7 +402,9 @@ class OdometryEdges(Bounded, ExternalSensor):
         if lengths.factor != 1:
             text += f"; its lengths are multiplied by {lengths.factor:.3f}, as tracked ones differ"
         metric = compared is not None and compared.lengths_agree(scales)
-        record = SensorRecord("odometry", len(first), len(kept), scale, text, metric)
+        record = SensorRecord(
+            "odometry", len(first), len(kept), scale, text, lengths.factor, metric
+        )
         verified = self.scale is not None or (compared is not None and compared.verified)
         return SensorPriors(
             steps, records=(record,), verified=verified and not is_wrong, lengths=lengths.factor

@@ -292,20 +292,24 @@ def with_prior(
 
 
 def with_known_odometry(
-    recording: Recording, config: Config, scale: float | None
+    recording: Recording, config: Config, record: external_sensors.SensorRecord | None
 ) -> tuple[Recording, Config]:
-    """Return both with a known factor on the errors of odometry; without odometry if it is None.
+    """Return both with known factors on odometry and its errors; without odometry if it is None.
 
     For a recording whose path rests on its odometry already, see `OdometryEdges.scale`.
     """
-    if scale is None:
+    if record is None:
         sensors = (p for p in config.priors if not isinstance(p, external_sensors.OdometryEdges))
         if recording.odometry is not None:
             recording = with_odometry(recording, np.full((len(recording), 4, 4), np.nan))
         return recording, replace(config, priors=tuple(sensors))
     recording, config = with_prior(recording, config, "auto")
+    if recording.odometry is not None and record.lengths != 1:
+        scaled = recording.odometry.copy()
+        scaled[:, :3, 3] *= record.lengths
+        recording = with_odometry(recording, scaled)
     sensors = (
-        replace(p, scale=scale) if isinstance(p, external_sensors.OdometryEdges) else p
+        replace(p, scale=record.scale) if isinstance(p, external_sensors.OdometryEdges) else p
         for p in config.priors
     )
     return recording, replace(config, priors=tuple(sensors))
