@@ -27,7 +27,12 @@ from tofuse.engine.quality.map_agreement import (
     consistency_of_images,
     map_consistency,
 )
-from tofuse.formats.poses.trajectory import associated_poses, interpolated_poses, write_tum
+from tofuse.formats.poses.trajectory import (
+    associated_poses,
+    interpolated_poses,
+    odometry_at,
+    write_tum,
+)
 from tofuse.formats.readers.native import NativeSource
 from written_run_json import write_run
 
@@ -269,6 +274,22 @@ def test_odometry_is_interpolated_between_its_poses() -> None:
     np.testing.assert_allclose(quarter, 0.25 * se3.log(se3.inverse(T[0]) @ T[1]), atol=1e-9)
     np.testing.assert_allclose(half, 0.5 * se3.log(se3.inverse(T[3]) @ T[4]), atol=1e-9)
     assert np.isnan(interpolated_poses(at, [], np.zeros((0, 4, 4)))).all()
+
+
+def test_missing_pose_of_odometry_stays_missing() -> None:
+    """Poses at every second image are interpolated, but one that is missing among others isn't."""
+    T, images = path(9), np.arange(9) / 10
+    slow = odometry_at(images, images[::2], T[::2])
+    assert np.isfinite(slow).all()
+    known = np.arange(9) != 4
+    assert np.isnan(odometry_at(images, images[known], T[known])).all((1, 2)).tolist() == [
+        k == 4 for k in range(9)
+    ]
+    # The nearest pose, in such a gap, and if there are too few to know their interval.
+    near = odometry_at(images, images[known] - 0.015, T[known])
+    np.testing.assert_array_equal(near[3], T[3])
+    two = odometry_at(images[:3], images[[0, 2]], T[[0, 2]])
+    assert np.isnan(two).all((1, 2)).tolist() == [False, True, False]
 
 
 def test_depths_are_requantized_to_recording_unit() -> None:
