@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from tofuse.formats.poses.trajectory import (
         associated_poses,
         interpolated_poses,
-        odometry_at,
         read_tum,
         write_kitti,
         write_log,

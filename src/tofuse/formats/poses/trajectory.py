@@ -16,7 +16,7 @@ from tofuse.engine.geometry import quaternion, se3
 from tofuse.engine.times import MAX_GAP_S, partners
 from tofuse.formats.files import atomic, reading, tables
 
-MAX_INTERVAL_S = 0.5  # of poses to interpolate between
+_MAX_INTERVAL_S = 0.5  # of poses to interpolate between
 
 
 def read_tum(path: str | Path) -> tuple[Float64, Float64]:
@@ -198,30 +198,14 @@ def associated_poses(timestamps: ArrayLike, others: ArrayLike, poses: ArrayLike)
     return out
 
 
-def odometry_at(timestamps: ArrayLike, others: ArrayLike, poses: ArrayLike) -> Float64:
-    """Return poses (N, 4, 4) of odometry at timestamps (N,), NaN where unknown.
-
-    Interpolated over its usual interval, as its clock need not be the camera's. Over longer ones
-    a pose is missing; there only the nearest one counts, see `associated_poses`.
-    """
-    usual = np.diff(np.sort(np.asarray(others, float)))
-    limit = min(MAX_INTERVAL_S, 1.5 * float(np.median(usual))) if len(usual) > 1 else 0.0
-    out = interpolated_poses(timestamps, others, poses, limit)
-    unknown = ~np.isfinite(out).all((1, 2))
-    out[unknown] = associated_poses(timestamps, others, poses)[unknown]
-    return out
-
-
 def interpolated_poses(
-    timestamps: ArrayLike,
-    others: ArrayLike,
-    poses: ArrayLike,
-    max_interval_s: float = MAX_INTERVAL_S,
+    timestamps: ArrayLike, others: ArrayLike, poses: ArrayLike, *, over_gaps: bool = True
 ) -> Float64:
     """Return poses (N, 4, 4) at timestamps (N,), between those (M, 4, 4) at others (M,).
 
-    NaN more than 0.02 s before the first or after the last, and between poses farther apart than
-    `max_interval_s`.
+    NaN more than 0.02 s before the first or after the last, and between poses more than half a
+    second apart. Unless `over_gaps`, only over the usual interval of the poses, as over a longer
+    one a pose is missing; there the nearest one counts, see `associated_poses`.
     """
     at, others, poses = (np.asarray(x, float) for x in (timestamps, others, poses))
     out = np.full((len(at), 4, 4), np.nan)
@@ -230,11 +214,16 @@ def interpolated_poses(
     if not len(order):
         return out
     times, T = others[order], poses[order]
+    limit = _MAX_INTERVAL_S
+    if not over_gaps:
+        out = associated_poses(at, others, poses)
+        usual = float(np.median(np.diff(times))) if len(times) > 2 else 0.0
+        limit = min(limit, 1.5 * usual)
     after = np.searchsorted(times, at)
     a, b = (after - 1).clip(0), after.clip(0, len(times) - 1)
     span = times[b] - times[a]
     fraction = np.where(span > 0, (at - times[a]) / np.where(span > 0, span, 1), 0.0)
-    inside = (span <= max_interval_s) & (fraction >= 0) & (fraction <= 1)
+    inside = (span <= limit) & (fraction >= 0) & (fraction <= 1)
     nearest = np.minimum(np.abs(at - times[a]), np.abs(at - times[b]))
     valid = np.where(a == b, nearest <= MAX_GAP_S, inside)
     out[valid] = se3.interpolate(T[a[valid]], T[b[valid]], fraction[valid])

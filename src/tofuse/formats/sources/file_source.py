@@ -17,7 +17,6 @@ from tofuse.engine.quantities import count
 from tofuse.formats.cameras import camera_file
 from tofuse.formats.files import reading
 from tofuse.formats.images import check_first_size, first_size, read_color, read_image
-from tofuse.formats.poses import odometry_at
 from tofuse.formats.sources.inputs import read_timestamps, tum_poses
 from tofuse.formats.sources.pixels import resized, sampled_color
 from tofuse.formats.sources.reader import ReaderOptions
@@ -139,7 +138,7 @@ class FileSource(ABC):
         if reading.is_file(folder / "groundtruth.txt"):
             self.reference = tum_poses(self, folder / "groundtruth.txt")
         if reading.is_file(folder / "odometry.txt"):
-            self.odometry = tum_poses(self, folder / "odometry.txt", odometry_at)
+            self.odometry = tum_poses(self, folder / "odometry.txt", interpolated=True)
 
     def note_missing_color(self, color: Sequence[object]) -> None:
         """Warn if some of the frames have no colour: None in `color`."""

@@ -15,7 +15,7 @@ from tofuse.engine.errors import InputError
 from tofuse.engine.frames import Source
 from tofuse.engine.geometry import se3
 from tofuse.formats.files import reading, tables
-from tofuse.formats.poses import associated_poses, read_tum
+from tofuse.formats.poses import associated_poses, interpolated_poses, read_tum
 from tofuse.formats.sources.reader import ReaderOptions
 
 PER_FRAME = "a camera per frame"
@@ -88,17 +88,16 @@ def files_at(path: Path, *suffixes: str) -> list[Path]:
     return reading.files_with(path, *suffixes) if reading.is_folder(path) else []
 
 
-def tum_poses(
-    source: Source,
-    path: Path,
-    at: Callable[[Float64, Float64, Float64], Float64] = associated_poses,
-) -> Float64:
+def tum_poses(source: Source, path: Path, *, interpolated: bool = False) -> Float64:
     """Return (N, 4, 4) poses of a TUM file at the source's timestamps, NaN without a match.
 
-    Each frame has the pose nearest in time, or what `at` returns of timestamps, times and poses.
+    Those nearest in time, or interpolated over their usual interval.
     """
     times, poses = read_tum(path)
-    out = at(source.timestamps, times, poses)
+    if interpolated:
+        out = interpolated_poses(source.timestamps, times, poses, over_gaps=False)
+    else:
+        out = associated_poses(source.timestamps, times, poses)
     posed = int(np.isfinite(out[:, 0, 0]).sum())
     if posed < len(out):
         source.warnings.append(
