@@ -101,7 +101,7 @@ def tum_poses(source: Source, path: Path, *, interpolated: bool = False) -> Floa
     posed = int(np.isfinite(out[:, 0, 0]).sum())
     if posed < len(out):
         source.warnings.append(
-            f"{path}: {posed} of {len(out)} frames have a pose at the time of their timestamp"
+            f"{path}: {posed} of {len(out)} frames have a pose at their timestamp"
         )
     return out
 
