@@ -1,126 +1,86 @@
-"""Odometry of wheels, with the errors that wheels have: whole runs with it and without.
+"""Availability of wheels of all dependencies, for each system and version of Python.
 
-Recordings of the second simulator (`other_sensor.py`) with odometry of the camera: the true motion
-with an error of each step of 1 % of its length and of its angle, and in addition a wrong radius of
-the wheels, a slip, wrong angles, a clock that is late, or half of the poses. Each is reconstructed
-with `--prior device`. A row has, without and with the odometry, the rms error of the poses and the
-stated bound, mm; at the end, by the error of the odometry, their medians, how many bounds are
-finite, and how many errors are within them.
+    python benchmarks/wheels.py [--only dask scan ...]
 
-    python benchmarks/wheels.py [--seeds 71 72] [--cameras "old tof"] [--scenes "aisle, ahead"]
+Resolves the dependencies in `pyproject.toml`, without and with each extra, from wheels only, as
+`pip` would on that system, and prints which are available and what is missing. Nothing is
+installed. Needs uv (`pip install uv`) and a package index.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
 
-import numpy as np
-
-import other_sensor
-from fixed_pattern import judged
-from tofuse.engine.arrays import Float64
-from tofuse.engine.frames.recording import ArraySource, Recording
-from tofuse.engine.geometry import se3
-from tofuse.engine.graph.external_sensors import OdometryEdges
-from tofuse.engine.mapping.methods import from_method
-from tofuse.formats.poses import interpolated_poses
-
-NOISE = 0.01  # of lengths and of angles
-SLIP_M, SLIP_STEPS = 0.15, 3
-ERRORS: dict[str, Callable[[Float64], Float64]] = {
-    "none": lambda steps: steps,
-    "lengths 2 % long": lambda steps: _scaled(steps, 1.02, 1.0),
-    "lengths 5 % short": lambda steps: _scaled(steps, 0.95, 1.0),
-    "angles 3 % large": lambda steps: _scaled(steps, 1.0, 1.03),
-    "slip of 15 cm": lambda steps: _slipping(steps),
+ROOT = Path(__file__).resolve().parents[1]
+PYTHONS = ("3.11", "3.12", "3.13", "3.14")
+# Names of platforms in uv, and common names.
+SYSTEMS = {
+    "x86_64-pc-windows-msvc": "Windows",
+    "aarch64-apple-darwin": "macOS arm64",
+    "x86_64-manylinux_2_28": "Linux x86-64",
+    "aarch64-manylinux_2_28": "Linux arm64",
 }
-LATE, SPARSE = "0.1 s late", "every 2nd pose"
+_LACKING = re.compile(
+    r"\b([a-z0-9][a-z0-9._-]*)(?:[<>=!~,]=?[\w.,<>=]*)? has no (?:usable )?wheels"
+)
 
 
-def _scaled(steps: Float64, lengths: float, angles: float) -> Float64:
-    """Return motions (K, 4, 4) with these factors on their lengths and angles."""
-    out = np.array([se3.exp(np.append(np.zeros(3), angles * se3.log(T)[3:])) for T in steps])
-    out[:, :3, 3] = lengths * steps[:, :3, 3]
-    return out
+def main() -> int:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = list(project["optional-dependencies"])
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--only", nargs="+", choices=extras, default=extras, metavar="EXTRA")
+    arguments = parser.parse_args()
+    uv = shutil.which("uv") or shutil.which("uv", path=str(Path(sys.executable).parent))
+    if uv is None:
+        raise SystemExit("uv is missing: pip install uv")
+    print("| | " + " | ".join(SYSTEMS.values()) + " |")
+    print("|---" * (1 + len(SYSTEMS)) + "|")
+    whole = True
+    for extra in (None, *arguments.only):
+        cells = []
+        for system in SYSTEMS:
+            lacking = {python: missing(uv, system, python, extra) for python in PYTHONS}
+            whole &= extra is not None or not any(lacking.values())
+            cells.append(cell(lacking))
+        name = "required" if extra is None else f"`{extra}`"
+        print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+    return 0 if whole else 1
 
 
-def _slipping(steps: Float64) -> Float64:
-    out, first = steps.copy(), 2 * len(steps) // 3
-    out[first : first + SLIP_STEPS, 2, 3] += SLIP_M / SLIP_STEPS
-    return out
+def missing(uv: str, system: str, python: str, extra: str | None) -> str:
+    """Return the packages without a wheel on a platform; empty if none."""
+    command = [uv, "pip", "compile", "--quiet", "--no-header", "--only-binary", ":all:"]
+    command += ["--python-platform", system, "--python-version", python, "pyproject.toml"]
+    command += [] if extra is None else ["--extra", extra]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    return "" if done.returncode == 0 else reason(done.stderr)
 
 
-def odometry(poses: Float64, error: str, seed: int) -> Float64:
-    """Return poses (N, 4, 4) by wheels, one frame apart, given the true ones."""
-    rng = np.random.default_rng([seed, 5])
-    steps = se3.inverse(poses[:-1]) @ poses[1:]
-    length, angle = np.linalg.norm(steps[:, :3, 3], axis=1), se3.angle(steps)
-    noise = NOISE * np.repeat(np.stack([length, angle], 1), 3, axis=1)
-    steps = steps @ se3.exp(noise * rng.standard_normal((len(steps), 6)))
-    out = [np.eye(4)]
-    for step in ERRORS.get(error, ERRORS["none"])(steps):
-        out.append(out[-1] @ step)
-    return np.array(out)
+def reason(message: str) -> str:
+    """Return the packages without a wheel from uv's message, or else its beginning."""
+    text = " ".join(message.split())
+    found = sorted(set(_LACKING.findall(text)))
+    return ", ".join(found) if found else text[:200] or "not resolved"
 
 
-def with_odometry(recording: Recording, error: str, seed: int) -> Recording:
-    """Return a recording with odometry that has this error."""
-    assert recording.reference is not None
-    times = recording.timestamps
-    poses = odometry(recording.reference, error, seed)
-    if error == LATE:
-        poses = interpolated_poses(times, times + 0.1, poses)
-    if error == SPARSE:
-        poses = interpolated_poses(times, times[::2], poses[::2])
-    frames = [recording[k] for k in range(len(recording))]
-    source = ArraySource(frames, recording.reference, poses, metadata=dict(recording.metadata))
-    return Recording.of(source, recording.path, recording.format)
-
-
-def main() -> None:
-    """Run all, print a row for each and the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--seeds", nargs="*", type=int, default=[71, 72])
-    parser.add_argument("--cameras", nargs="*", default=["old tof", "azure"])
-    parser.add_argument("--scenes", nargs="*", default=["aisle, ahead", "bare room, turn"])
-    given = parser.parse_args()
-    plain = from_method("default")
-    config = replace(plain, priors=(*plain.priors, OdometryEdges()))
-    print("| recording | odometry | error, mm: without, with | bound, mm |\n" + "|---" * 4 + "|")
-    found: dict[str, list[tuple[tuple[float, float], tuple[float, float]]]] = {}
-    for seed in given.seeds:
-        for camera in given.cameras:
-            for scene in given.scenes:
-                recording = other_sensor.record(scene, camera, seed, indirect=False)
-                without = judged(recording, plain)
-                for error in (*ERRORS, LATE, SPARSE):
-                    aided = judged(with_odometry(recording, error, seed), config)
-                    found.setdefault(error, []).append((without, aided))
-                    print(
-                        f"| {scene}, {camera}, seed {seed} | {error} | {without[0]:.1f}, "
-                        f"{aided[0]:.1f} | {without[1]:.1f}, {aided[1]:.1f} |",
-                        flush=True,
-                    )
-    print("\n| odometry | runs | median error, mm: without, with | bounded | within the bound |")
-    print("|---" * 5 + "|")
-    for error, runs in found.items():
-        print(f"| {error} | {len(runs)} | {_by_use(runs)} |")
-
-
-def _by_use(runs: Sequence[tuple[tuple[float, float], tuple[float, float]]]) -> str:
-    errors, bounds = np.array(runs).transpose(2, 1, 0)  # (without and with, runs)
-    bounded = np.isfinite(bounds)
-    cells = [
-        [f"{x:.1f}" for x in np.median(errors, axis=1)],
-        [str(x) for x in bounded.sum(1)],
-        [str(x) for x in (bounded & (errors <= bounds)).sum(1)],
-    ]
-    return " | ".join(", ".join(pair) for pair in cells)
+def cell(lacking: dict[str, str]) -> str:
+    """Format a cell: versions with all wheels, and what the others lack."""
+    if not any(lacking.values()):
+        return f"{PYTHONS[0]} to {PYTHONS[-1]}"
+    if all(lacking.values()) and len(set(lacking.values())) == 1:
+        return f"no {lacking[PYTHONS[0]]}"
+    have = [python for python in PYTHONS if not lacking[python]]
+    parts = [f"{have[0]} to {have[-1]}"] if have else []
+    parts += [f"{python}: no {what}" for python, what in lacking.items() if what]
+    return "; ".join(parts)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

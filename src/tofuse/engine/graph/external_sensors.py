@@ -524,10 +524,8 @@ class _Comparison:
         tracked = np.concatenate([se3.log(part.tracked)[:, 3:], part.tracked[:, :3, 3]])
         for _ in range(_MOUNTING_ROUNDS):
             moved = t - ((np.eye(3) - R) @ T_body_camera[:3, 3])
-            U, _, Vt = np.linalg.svd(
-                np.concatenate([se3.log(part.odometry)[:, 3:], moved]).T @ tracked
-            )
-            T_body_camera[:3, :3] = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+            of_body = np.concatenate([se3.log(part.odometry)[:, 3:], moved])
+            T_body_camera[:3, :3] = se3.nearest_rotation(of_body.T @ tracked)
             left = t - part.tracked[:, :3, 3] @ T_body_camera[:3, :3].T
             arm = np.linalg.lstsq((np.eye(3) - R).reshape(-1, 3), left.ravel(), rcond=1e-3)[0]
             T_body_camera[:3, 3] = arm
