@@ -158,7 +158,7 @@ def long_run(count: int) -> None:
     marks = {round(count * fraction) for fraction in (0.05, 0.1, 0.2, 0.4, 0.7, 1.0)}
     kept_s: list[float] = []
     print(
-        f"{'frames':>7} {'views':>6} {'views MB':>9} {'store ms/view':>16} "
+        f"{'frames':>7} {'views':>6} {'store ms/view':>16} "
         f"{'fuse ms/view':>15} {'fuse ms/frame':>16} {'vertices':>9} {'peak MB':>8}"
     )
     for frame, T in around_the_room(count):
@@ -175,7 +175,7 @@ def long_run(count: int) -> None:
         assert model.mesh is not None
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
         print(
-            f"{len(poses):>7} {builder.views:>6} {builder.nbytes / 1e6:>9.0f} "
+            f"{len(poses):>7} {builder.views:>6} "
             f"{1e3 * np.median(kept_s):>16.2f} {1e3 * fused_s / builder.views:>15.2f} "
             f"{1e3 * fused_s / len(poses):>16.2f} {len(model.mesh):>9,} {peak:>8.0f}",
             flush=True,

@@ -99,7 +99,7 @@ def main() -> None:
                 [each.diagnostics.accuracy.position_m for each in results],
             ]
             assert scan.mesh is not None
-            coverage = np.median([planning._coverage(scan.mesh, r, np.eye(4)) for r in results])
+            coverage = np.median([planning._coverage(scan.mesh, r, plan.poses) for r in results])
             predicted_m, achieved_m = np.median(bounds, axis=1)
             ratios.append(predicted_m / achieved_m)
             columns = [", ".join(f"{1e3 * each:.1f}" for each in bound) for bound in bounds]
